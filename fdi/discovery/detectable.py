@@ -74,8 +74,8 @@ def find_hidden_effects(problem: Problem, fit: Fit, effects: Iterable[str]) -> l
         effects: names of the catalogue.
     """
     ways = [way for name in effects for way in list_directions(name, problem.model)]
-    won = VirtualTest(problem, fit).measure_gains(ways, [way.most for way in ways]) if ways else []
-    usual = {way.effect: way.most for way, gained in zip(ways, won, strict=True) if gained < GAIN_DETECTED}
+    gains = VirtualTest(problem, fit).measure_gains(ways, [way.most for way in ways]) if ways else []
+    usual = {way.effect: way.most for way, gain in zip(ways, gains, strict=True) if gain < GAIN_DETECTED}
     return [Blind(e.name, e.fitted[0], usual[e.name], e.parameters[e.fitted[0]].unit, e.revealed_by or MORE_MOTION)
             for e in map(problem.model.find_effect, usual)]
 
@@ -85,15 +85,15 @@ def list_directions(effect: str, model: Model) -> list[Direction]:
     entry = model.find_effect(effect)
     first = entry.fitted[0]
     off = entry.off.get(first, model.nominal.get(first, 0.0))
-    found: dict[bool, Direction] = {}
+    directions: dict[bool, Direction] = {}
     for start in entry.starts:
         reach = start[first] - off
         if reach == 0.0:
             continue
         size = abs(reach)
-        before = found.get(reach > 0.0, Direction(effect, start, size, size, size))
-        found[reach > 0.0] = before._replace(least=min(before.least, size), most=max(before.most, size))
-    return list(found.values())
+        before = directions.get(reach > 0.0, Direction(effect, start, size, size, size))
+        directions[reach > 0.0] = before._replace(least=min(before.least, size), most=max(before.most, size))
+    return list(directions.values())
 
 
 def move_effect(model: Model, values: Mapping[str, float], way: Direction, size: float) -> dict[str, float]:
@@ -101,12 +101,12 @@ def move_effect(model: Model, values: Mapping[str, float], way: Direction, size:
 
     The others move along in proportion; those that say where an effect is have their starting values.
     """
-    entry, at = model.find_effect(way.effect), {}
+    entry, parameters = model.find_effect(way.effect), {}
     for name, start in way.start.items():
         off = entry.off.get(name, model.nominal.get(name, 0.0))
-        moved = values[name] + (start - off) * size / way.reach
-        at[name] = start if entry.parameters[name].unit in WITHOUT_SIZE else moved
-    return at
+        new_value = values[name] + (start - off) * size / way.reach
+        parameters[name] = start if entry.parameters[name].unit in WITHOUT_SIZE else new_value
+    return parameters
 
 
 @dataclass
@@ -141,38 +141,38 @@ class VirtualTest:
         with_effect = compute_misfit(self._whiten(self._predict_values(self.problem, names, rows) - run))
         with_effect = np.minimum(with_effect, self.moved_stops)
         model = self.problem.model
-        own = np.array([[name in model.find_effect(way.effect).fitted for name in self.names] for way in ways])
-        known = np.where(own, 0.0, self.prior) @ self.fit.x**2  # the effect has no prior on its own parameters
-        begun = np.array([self._list_beginnings(dict(zip(names, row, strict=True))) for row in rows])
-        costs, left = self._measure_costs(begun, run)
+        is_own = np.array([[name in model.find_effect(way.effect).fitted for name in self.names] for way in ways])
+        prior_costs = np.where(is_own, 0.0, self.prior) @ self.fit.x**2  # the effect has no prior on its own parameters
+        starts = np.array([self._list_beginnings(dict(zip(names, row, strict=True))) for row in rows])
+        costs, residuals = self._measure_costs(starts, run)
         best = np.argmin(costs, axis=1)
-        still = np.arange(len(ways))
-        x, white, cost = begun[still, best], left[still, best], costs[still, best]
+        indices = np.arange(len(ways))
+        x, white, cost = starts[indices, best], residuals[indices, best], costs[indices, best]
         for _ in range(6):
-            still = still[cost[still] - known[still] - with_effect[still] > GAIN_DETECTED]
-            if not len(still):
+            indices = indices[cost[indices] - prior_costs[indices] - with_effect[indices] > GAIN_DETECTED]
+            if not len(indices):
                 break
-            steps = np.array([self._list_steps(white[k], x[k]) for k in still])
-            trials = np.clip(x[still, None] + steps, *self.bounds)
-            costs, left = self._measure_costs(trials, run[still])
+            steps = np.array([self._list_steps(white[k], x[k]) for k in indices])
+            trials = np.clip(x[indices, None] + steps, *self.bounds)
+            costs, residuals = self._measure_costs(trials, run[indices])
             best = np.argmin(costs, axis=1)
             least = np.take_along_axis(costs, best[:, None], 1)[:, 0]
-            won = cost[still] - least
-            for n in np.flatnonzero(won > 0.0):
-                k = still[n]
-                cost[k], x[k], white[k] = least[n], trials[n, best[n]], left[n, best[n]]
-            still = still[won > np.maximum(3.0, 0.02 * cost[still])]
+            gains = cost[indices] - least
+            for n in np.flatnonzero(gains > 0.0):
+                k = indices[n]
+                cost[k], x[k], white[k] = least[n], trials[n, best[n]], residuals[n, best[n]]
+            indices = indices[gains > np.maximum(3.0, 0.02 * cost[indices])]
 
         def refit(k: int) -> float:
             """With slopes of its own, as a fit to a measured run has them."""
             beyond_doubt = 1000.0 * GAIN_DETECTED  # no refit takes as much
-            if not GAIN_DETECTED < cost[k] - known[k] - with_effect[k] < beyond_doubt:
+            if not GAIN_DETECTED < cost[k] - prior_costs[k] - with_effect[k] < beyond_doubt:
                 return float(cost[k])
             own_run = SimulatedRun(**vars(self.problem), run=run[k])
             return min(float(cost[k]), fit_unknowns(own_run, self.fit.free, x[k], REFIT_ROUNDS).cost)
 
-        refitted = map_in_threads(refit, range(len(ways)), self.problem.workers)
-        return [float(c) for c in np.array(refitted) - known - with_effect]
+        last_costs = map_in_threads(refit, range(len(ways)), self.problem.workers)
+        return [float(c) for c in np.array(last_costs) - prior_costs - with_effect]
 
     @cached_property
     def moved_stops(self) -> float:
@@ -191,8 +191,8 @@ class VirtualTest:
         """
         m, k, p = trials.shape
         flat = trials.reshape(-1, p)
-        predicted = self._predict_values(self.problem, self.names, self.problem.convert_unknowns(self.fit.free, flat))
-        white = self._whiten(predicted - np.repeat(runs, k, 0))
+        predictions = self._predict_values(self.problem, self.names, self.problem.convert_unknowns(self.fit.free, flat))
+        white = self._whiten(predictions - np.repeat(runs, k, 0))
         costs = compute_misfit(white) + flat**2 @ self.prior
         return costs.reshape(m, k), white.reshape(m, k, *white.shape[1:])
 
@@ -202,14 +202,14 @@ class VirtualTest:
         Parameters of the effect that have a tolerance take its values. Where a direction that no signal shows leads
         through a parameter that has none, the others go the other way; so they do for a changed viscosity.
         """
-        held = {**self.problem.model.values, **self.fit.values}
+        base_values = {**self.problem.model.values, **self.fit.values}
         x = np.array([(values[f.name] - f.centre) / f.scale for f in self.fit.free])
         for way in (*list_powers(self.problem), VISCOSITY):
             first = next(iter(way))
-            if first in self.names or values.get(first, held.get(first)) == held.get(first):
+            if first in self.names or values.get(first, base_values.get(first)) == base_values.get(first):
                 continue
-            ratio = (1.0 - values[first]) / (1.0 - held[first]) if first == "filter.clogging" else \
-                values[first] / held[first]
+            ratio = (1.0 - values[first]) / (1.0 - base_values[first]) if first == "filter.clogging" else \
+                values[first] / base_values[first]
             x = scale_together(self.fit.free, x, way, -float(np.log(max(ratio, 0.01))))
         return np.asarray(np.clip([self.fit.x, x], *self.bounds))
 
@@ -226,8 +226,8 @@ class VirtualTest:
         model = self.problem.model
         names = list(dict.fromkeys([*self.names, *(name for way in ways for name in way.start)]))
         values = {**model.values, **self.fit.values}
-        moved = [move_effect(model, values, way, size) for way, size in zip(ways, sizes, strict=True)]
-        return names, np.array([[at.get(name, values[name]) for name in names] for at in moved])
+        parameter_sets = [move_effect(model, values, way, size) for way, size in zip(ways, sizes, strict=True)]
+        return names, np.array([[each.get(name, values[name]) for name in names] for each in parameter_sets])
 
     def _predict_values(self, problem: Problem, names: Sequence[str], rows: Floats, together: int = 64) -> Floats:
         parts = np.array_split(rows, -(-len(rows) // together))
@@ -235,8 +235,8 @@ class VirtualTest:
 
     def _whiten(self, difference: Floats) -> Floats:
         """A difference of runs, (m, s, n) SI, as the fit counts it: without the mains, where it was measured."""
-        measured = self.problem.trace.measurements
-        return self.problem.whiten_residuals(self.problem.subtract_measurements(difference + measured))
+        measurements = self.problem.trace.measurements
+        return self.problem.whiten_residuals(self.problem.subtract_measurements(difference + measurements))
 
 
 SECONDS = 3.0
@@ -263,17 +263,17 @@ def find_separation(search: Search, equal: Sequence[Hypothesis]) -> Separation |
     if not pairs:
         return None
     names = tuple(dict.fromkeys(e for h in equal for e in h.effects))
-    own = search.problem.trace
-    missing = tuple(s for s in own.output_names if s not in own.outputs)
+    trace = search.problem.trace
+    missing = tuple(s for s in trace.output_names if s not in trace.outputs)
     for more in dict.fromkeys([*((s,) for s in missing), missing] if missing else []):
-        left = min(_measure_misfit(search, a, b, _same_command(search, a, (*own.outputs, *more))) for a, b in pairs)
-        if left > MISFIT_DISCRIMINATES:
-            return Separation(names, f"measure {' and '.join(more)} too, on the same command", {}, left)
+        misfit = min(_measure_misfit(search, a, b, _same_command(search, a, (*trace.outputs, *more))) for a, b in pairs)
+        if misfit > MISFIT_DISCRIMINATES:
+            return Separation(names, f"measure {' and '.join(more)} too, on the same command", {}, misfit)
     best = None
-    for words, command, play in list_commands(own):
-        left = min(_measure_misfit(search, a, b, _simulate_command(search, a, play, own.outputs)) for a, b in pairs)
-        if left > MISFIT_DISCRIMINATES and (best is None or left > best.misfit):
-            best = Separation(names, words, command, left)
+    for words, command, play in list_commands(trace):
+        misfit = min(_measure_misfit(search, a, b, _simulate_command(search, a, play, trace.outputs)) for a, b in pairs)
+        if misfit > MISFIT_DISCRIMINATES and (best is None or misfit > best.misfit):
+            best = Separation(names, words, command, misfit)
     return best
 
 
@@ -298,8 +298,8 @@ def list_commands(trace: Trace) -> list[Command]:
                 lambda t: (np.where((t > 0.3) & (t < 1.8), to, 0.0), np.zeros_like(t)))
 
     small, middle, wide, far, beyond = (size * trace.scale for size in (2e-4, 2e-3, 3e-3, 20e-3, 45e-3))
-    pushed = f"{1e-3 * push:g} kN" if load_signal and load_signal.unit == "N" else f"{push:g}"
-    return [*([sine(wide, 1.0, push, f" against a load of {pushed}")] if push else []),
+    load_text = f"{1e-3 * push:g} kN" if load_signal and load_signal.unit == "N" else f"{push:g}"
+    return [*([sine(wide, 1.0, push, f" against a load of {load_text}")] if push else []),
             sine(middle, 10.0), sine(small, 20.0), sine(far, 1.0), step(f"of {name(far)}", far),
             *([step(f"into the end stop, {name(beyond)},", beyond)] if signal.limit else [])]
 
@@ -307,10 +307,10 @@ def list_commands(trace: Trace) -> list[Command]:
 def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Trace:
     """The run as a hypothesis predicts it, with more sensors."""
     names = [f.name for f in h.fit.free]
-    predicted = search.problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
-    own = search.problem.trace
-    return own.with_columns(dict(zip(own.output_names, predicted, strict=True)), usable=np.ones(len(own), bool),
-                            outputs=tuple(s for s in own.output_names if s in signals))
+    columns = search.problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
+    trace = search.problem.trace
+    return trace.with_columns(dict(zip(trace.output_names, columns, strict=True)), usable=np.ones(len(trace), bool),
+                              outputs=tuple(s for s in trace.output_names if s in signals))
 
 
 def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tuple[Floats, Floats]],
@@ -323,8 +323,8 @@ def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tu
                           com, load, signals)
 
 
-def _measure_misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, seen: Trace) -> float:
+def _measure_misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, trace: Trace) -> float:
     """What `wrong` leaves of what `truth` predicts, noise aside, -2 log likelihood."""
     noise = search.sensors | dict(zip(search.problem.trace.outputs, search.noise, strict=True))
-    problem = replace(search.problem, trace=seen, noise=tuple(noise[s] for s in seen.outputs), also=())
+    problem = replace(search.problem, trace=trace, noise=tuple(noise[s] for s in trace.outputs), also=())
     return fit_unknowns(problem, wrong.fit.free, wrong.fit.x, rounds=3).misfit

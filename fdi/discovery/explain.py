@@ -144,55 +144,57 @@ def _search_levels(search: Search, base: Hypothesis, progress: Progress) -> list
     for count in (1, 2, 3):
         fits = 40 if count == 1 else 20 * len(beam)
         search.stage = Stage(progress, f"looking for effect {count}", shares[count - 1], shares[count], fits)
-        tried: list[Hypothesis] = []
+        ranking: list[Hypothesis] = []
         for parent in beam:
-            tried = drop_duplicates([*tried, *search.add_each_effect(parent, 8 if count == 1 else 4)])
-            if tried and tried[0].is_at_floor:
+            ranking = drop_duplicates([*ranking, *search.add_each_effect(parent, 8 if count == 1 else 4)])
+            if ranking and ranking[0].is_at_floor:
                 break  # the other ways would have to get there as well, from further off
-        if not tried and count == 1 and not base.is_at_floor:  # the fit of the base hides the way to any effect
-            tried = search.add_each_with_more_noise(base, [])
-        if not tried:
+        if not ranking and count == 1 and not base.is_at_floor:  # the fit of the base hides the way to any effect
+            ranking = search.add_each_with_more_noise(base, [])
+        if not ranking:
             break
         if count == 1 and not base.is_at_floor:
-            search.learn_noise(tried[0])
-            base, *best = search.map_parallel(search.refit_hypothesis, [base, *tried[:4]])
-            tried = sorted(best, key=lambda h: h.cost) + tried[4:]
-        if count == 1 and measure_gain(base, tried[0]) > GAIN_SEEN:  # more than what tolerances alone gain
-            levels[0] = [search.refit_base(base, tried[0])]
-        done = search.reaches_floor(tried[0])
-        if not done and count == 2 and levels[1][0].is_near_floor and measure_gain(levels[1][0], tried[0]) <= GAIN_SEEN:
+            search.learn_noise(ranking[0])
+            base, *best = search.map_parallel(search.refit_hypothesis, [base, *ranking[:4]])
+            ranking = sorted(best, key=lambda h: h.cost) + ranking[4:]
+        if count == 1 and measure_gain(base, ranking[0]) > GAIN_SEEN:  # more than what tolerances alone gain
+            levels[0] = [search.refit_base(base, ranking[0])]
+        is_done = search.reaches_floor(ranking[0])
+        if (not is_done and count == 2 and levels[1][0].is_near_floor
+                and measure_gain(levels[1][0], ranking[0]) <= GAIN_SEEN):
             # either no second effect is missing but stops that the first fit missed, or one whose gain such stops hide
             levels[1] = drop_duplicates([search.search_widely(levels[1][0]), *levels[1]])
-            levels.append(tried)
+            levels.append(ranking)
             break
-        if not done or tried[0].is_far or (levels[0][0].is_at_floor and levels[0][0].is_far):
+        if not is_done or ranking[0].is_far or (levels[0][0].is_at_floor and levels[0][0].is_far):
             # a fit in a local minimum leads the scan astray, and far tolerances may stand in for an effect
-            tried = drop_duplicates([*tried, *search.add_each_with_more_noise(beam[0], tried)])
-        if count == 2 and not done and takes_fair_share(search.problem, levels[1][0], tried[0]) and not \
-                search.reaches_floor(tried[0]):
-            tried = _search_other_valleys(search, levels, tried)
-        levels.append(tried)
+            ranking = drop_duplicates([*ranking, *search.add_each_with_more_noise(beam[0], ranking)])
+        if count == 2 and not is_done and takes_fair_share(search.problem, levels[1][0], ranking[0]) and not \
+                search.reaches_floor(ranking[0]):
+            ranking = _search_other_valleys(search, levels, ranking)
+        levels.append(ranking)
         before = levels[-2][0]
-        if ((done or tried[0].is_at_floor) and not tried[0].is_far) or measure_gain(before, tried[0]) <= GAIN_SEEN:
+        if (((is_done or ranking[0].is_at_floor) and not ranking[0].is_far)
+                or measure_gain(before, ranking[0]) <= GAIN_SEEN):
             break
         # the first effect is no such way: two large effects each help little alone
-        if count > 1 and not (takes_fair_share(search.problem, before, tried[0])
-                              and _improves(search, before, tried[0])):
+        if count > 1 and not (takes_fair_share(search.problem, before, ranking[0])
+                              and _improves(search, before, ranking[0])):
             break
-        beam = [h for h in tried[:2] if h.cost < tried[0].cost + 0.5 * (levels[0][0].cost - tried[0].cost)]
+        beam = [h for h in ranking[:2] if h.cost < ranking[0].cost + 0.5 * (levels[0][0].cost - ranking[0].cost)]
     return levels
 
 
-def _search_other_valleys(search: Search, levels: list[list[Hypothesis]], tried: Sequence[Hypothesis]
+def _search_other_valleys(search: Search, levels: list[list[Hypothesis]], pairs: Sequence[Hypothesis]
                           ) -> list[Hypothesis]:
     """Pairs of effects, best first, two of which a population has sought anew: two effects share many local minima.
 
     So is the best single effect where it leaves little: a stop that it missed is no second effect.
     """
     singles = [h for h in levels[1][:1] if h.is_near_floor]
-    found = search.map_parallel(search.search_widely, [*singles, *tried[:2]])
-    levels[1] = drop_duplicates([*found[:len(singles)], *levels[1]])
-    return drop_duplicates([*found[len(singles):], *tried])
+    hypotheses = search.map_parallel(search.search_widely, [*singles, *pairs[:2]])
+    levels[1] = drop_duplicates([*hypotheses[:len(singles)], *levels[1]])
+    return drop_duplicates([*hypotheses[len(singles):], *pairs])
 
 
 def takes_fair_share(problem: Problem, before: Hypothesis, after: Hypothesis) -> bool:
@@ -207,15 +209,15 @@ def _improves(search: Search, before: Hypothesis, after: Hypothesis) -> bool:
         return True
     floor = search.estimate_floor(after)
     noise = np.array([floor[s] for s in search.holdout.outputs])
-    left = [compute_typical_rms(each) / noise for each in search.replay_holdout([before, after])[1]]
-    excess = [float(np.sum(np.maximum(x**2 - 1.0, 0.0))) for x in left]
+    ratios = [compute_typical_rms(each) / noise for each in search.replay_holdout([before, after])[1]]
+    excess = [float(np.sum(np.maximum(x**2 - 1.0, 0.0))) for x in ratios]
     return excess[1] < ERROR_PARTLY_EXPLAINED * excess[0]
 
 
-def drop_duplicates(tried: Sequence[Hypothesis]) -> list[Hypothesis]:
+def drop_duplicates(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best hypothesis of each set of effects, best first."""
     best: dict[frozenset[str], Hypothesis] = {}
-    for h in sort_by_cost(tried):
+    for h in sort_by_cost(hypotheses):
         best.setdefault(frozenset(h.effects), h)
     return list(best.values())
 
@@ -225,9 +227,9 @@ def measure_gain(parent: Hypothesis, h: Hypothesis) -> float:
 
     Tolerances nearer to a healthy unit are a gain that no repeat can show.
     """
-    own = parent.cost - h.cost
-    nearer = parent.tolerance_cost - h.tolerance_cost
-    return min(own, nearer + 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else own
+    gain = parent.cost - h.cost
+    tolerance_gain = parent.tolerance_cost - h.tolerance_cost
+    return min(gain, tolerance_gain + 2.0 * (parent.repeat_cost - h.repeat_cost)) if h.others else gain
 
 
 def helps_explain(before: Hypothesis, after: Hypothesis, least: float) -> bool:
@@ -257,33 +259,33 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
         base, close = _doubt_small_gain(search, base, close, depth)
     close = leave_out_unneeded(search, _spare_far_tolerances(search, base, close))
     depth = len(close[0].effects) if close else 0
-    tried = levels[depth or -1] if max(depth, 1) < len(levels) else []
+    level = levels[depth or -1] if max(depth, 1) < len(levels) else []
     others = search.map_parallel(search.replay_hypothesis,
-                                 (h for h in tried if h.effects not in [c.effects for c in close]))
+                                 (h for h in level if h.effects not in [c.effects for c in close]))
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
     base, *close = (judge_left_out_rows(search, h, floor) for h in search.judge_on_all([base, *close], FINE))
     ledger = [base, *parents, *close[:1]]
-    told = [*ledger, *close[1:], *others[:3]]
-    held = dict(zip((h.effects for h in told), search.measure_holdout(told), strict=True))
+    hypotheses = [*ledger, *close[1:], *others[:3]]
+    holdout = dict(zip((h.effects for h in hypotheses), search.measure_holdout(hypotheses), strict=True))
     unseen = {h.effects: _judge_unseen_run(search, h, floor) for h in close}
     holding = [h for h in close if unseen[h.effects].holds]
     part = bool(close) and _improves(search, base, close[0])
     costs = search.measure_unseen_costs([base, *close])
-    verdict, named = decide_verdict(base, close, holding, part, marks, floor, costs)
+    verdict, effects = decide_verdict(base, close, holding, part, marks, floor, costs)
     if verdict == "PARTLY" and close and is_periodic_in_position(search, base, close[0]):
-        named = tuple(f.effect for f in marks.prints)
-        verdict = "PARTLY" if named else "UNEXPLAINED"
-    explained = close[0] if close and verdict == "EXPLAINED" else base
-    blind = search.compare_signatures(explained.fit)
+        effects = tuple(f.effect for f in marks.prints)
+        verdict = "PARTLY" if effects else "UNEXPLAINED"
+    best = close[0] if close and verdict == "EXPLAINED" else base
+    blind = search.compare_signatures(best.fit)
     progress("what this test cannot see", 0.94)
     doubtful = [*blind.list_unseen_effects(GAIN_DETECTED),
                 *(e for e in search.effects if search.model.find_effect(e).revealed_by)]
-    hard_to_see = [e for e in dict.fromkeys(doubtful) if e not in named]
-    hidden = find_hidden_effects(search.problem, explained.fit, hard_to_see if verdict in NOISE_LEFT else ())
-    if verdict == "NOTHING_MISSING" and 2 * len(hidden) > len(search.effects):
+    hard_to_see = [e for e in dict.fromkeys(doubtful) if e not in effects]
+    hidden_effects = find_hidden_effects(search.problem, best.fit, hard_to_see if verdict in NOISE_LEFT else ())
+    if verdict == "NOTHING_MISSING" and 2 * len(hidden_effects) > len(search.effects):
         verdict = "NOT_RESOLVABLE"
-    return Explanation(verdict, named, base, (*close, *others), tuple(ledger), floor, held, marks, blind, search,
-                       unseen, tuple(hidden))
+    return Explanation(verdict, effects, base, (*close, *others), tuple(ledger), floor, holdout, marks, blind, search,
+                       unseen, tuple(hidden_effects))
 
 
 def _choose_depth(search: Search, levels: list[list[Hypothesis]]) -> int:
@@ -323,16 +325,17 @@ def _finish_fits(search: Search, levels: Sequence[Sequence[Hypothesis]], depth: 
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
         close = sort_by_cost(close)
     # rivals of a fit that is not in doubt begin from its tolerances below
-    doubted = close[:2] if close and (close[0].is_poor or close[0].is_far) else []
-    base, *begun = search.map_parallel(search.leave_valley, [base, *search.map_parallel(search.begin_again, doubted)])
-    close = sort_by_cost([*begun, *close[len(doubted):]])
+    doubtful_fits = close[:2] if close and (close[0].is_poor or close[0].is_far) else []
+    base, *restarts = search.map_parallel(search.leave_valley,
+                                          [base, *search.map_parallel(search.begin_again, doubtful_fits)])
+    close = sort_by_cost([*restarts, *close[len(doubtful_fits):]])
     if close and ((is_cut and search.leave_out_undecided(close[0])) or search.leave_out_missed_stop(close[0])):
         base, *close = search.map_parallel(partial(search.finish_hypothesis, rounds=2), [base, *close])
-    known = [h.effects[0] for h in close]
+    effects = [h.effects[0] for h in close]
     base, close = _doubt_small_gain(search, base, close, depth)
-    if known and not close:  # an effect may yet do more from where the base is now than by its own fit
+    if effects and not close:  # an effect may yet do more from where the base is now than by its own fit
         near = fit_unknowns(search.problem, base.fit.free, base.fit.x, 4)
-        close = sort_by_cost(search.begin_effects(near, known))
+        close = sort_by_cost(search.begin_effects(near, effects))
     return _doubt_small_gain(search, base, _compare_rivals(search, close), depth)
 
 
@@ -347,8 +350,8 @@ def _compare_rivals(search: Search, close: list[Hypothesis]) -> list[Hypothesis]
     for _ in range(2):
         if not close or not close[0].is_at_floor:
             break
-        best, known = close[0], {frozenset(h.effects) for h in close if h.is_at_floor}
-        more = search.begin_look_alikes(best, known)
+        best, effect_sets = close[0], {frozenset(h.effects) for h in close if h.is_at_floor}
+        more = search.begin_look_alikes(best, effect_sets)
         close = drop_duplicates([*search.map_parallel(partial(begin, best=best), close), *more])
         if close[0] is best:
             break
@@ -376,8 +379,8 @@ def _spare_far_tolerances(search: Search, base: Hypothesis, close: list[Hypothes
     best = base if base.is_at_floor or not close else close[0]
     if not (best.is_at_floor and best.is_far) or any(spares_far_tolerances(best, h) for h in close):
         return close
-    found = search.add_each_in_place(best, LONG)
-    return [*(h for h in found if spares_far_tolerances(best, h)), *close]
+    hypotheses = search.add_each_in_place(best, LONG)
+    return [*(h for h in hypotheses if spares_far_tolerances(best, h)), *close]
 
 
 def leave_out_unneeded(search: Search, close: list[Hypothesis]) -> list[Hypothesis]:
@@ -393,10 +396,10 @@ def leave_out_unneeded(search: Search, close: list[Hypothesis]) -> list[Hypothes
         return close
     fewer = search.finish_hypothesis(search.drop_each_effect(close[0])[0])
     more = [h for h in close if set(fewer.effects) <= set(h.effects)]
-    needed = [h for h in more if fewer.is_far and not h.is_far and are_shown(h)]
-    if not fewer.is_at_floor or close[0] in needed:
+    healthy_fits = [h for h in more if fewer.is_far and not h.is_far and are_shown(h)]
+    if not fewer.is_at_floor or close[0] in healthy_fits:
         return close
-    return [*needed, fewer, *(h for h in close if h not in more)]
+    return [*healthy_fits, fewer, *(h for h in close if h not in more)]
 
 
 def shows_effect(model: Model, h: Hypothesis, effect: str, least_sd: float = INTERVAL_95_SD) -> bool:
@@ -450,31 +453,32 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
             return "UNEXPLAINED", prints
         return ("EXPLAINED" if prints else "NOTHING_MISSING"), prints
     best = close[0]
-    there = [h for h in holding if h.is_at_floor]
-    spared = [h for h in there if spares_far_tolerances(base, h)]
+    explanations = [h for h in holding if h.is_at_floor]
+    healthy_fits = [h for h in explanations if spares_far_tolerances(base, h)]
     # where the base leaves only noise: single stops that a fit has met by chance are missed elsewhere
-    sure = spared or [h for h in there
-                      if not (unseen and base.is_at_floor) or costs[()] - costs[h.effects] > GAIN_SEEN]
-    if base.is_at_floor and not spared and (measure_gain(base, best) < GAIN_CONVINCES or (there and not sure)):
+    sure = healthy_fits or [h for h in explanations
+                            if not (unseen and base.is_at_floor) or costs[()] - costs[h.effects] > GAIN_SEEN]
+    if (base.is_at_floor and not healthy_fits
+            and (measure_gain(base, best) < GAIN_CONVINCES or (explanations and not sure))):
         alike = [h for h in close if not h.is_far and measure_gain(base, h) > GAIN_SEEN
                  and not _is_better(best, h, costs)]
         return ("NOT_RESOLVABLE", _list_effects([best, *alike])) if not prints else ("EXPLAINED", prints)
-    there = sure
-    if there and all(h.is_far for h in there):
-        return "PARTLY", (*prints, *there[0].effects)
-    if best.is_at_floor and there and not firmware_left:
-        if spared:
-            equal = [h for h in there if measure_gain(h, there[0]) < GAIN_TIE]
+    explanations = sure
+    if explanations and all(h.is_far for h in explanations):
+        return "PARTLY", (*prints, *explanations[0].effects)
+    if best.is_at_floor and explanations and not firmware_left:
+        if healthy_fits:
+            equal = [h for h in explanations if measure_gain(h, explanations[0]) < GAIN_TIE]
         else:  # named alone only with the gain with which an effect is named where only noise is left without it
-            equal = [h for h in there if h is there[0] or (
-                not h.is_far and not _is_better(there[0], h, costs)
+            equal = [h for h in explanations if h is explanations[0] or (
+                not h.is_far and not _is_better(explanations[0], h, costs)
                 and not (base.is_at_floor and measure_gain(base, h) < GAIN_CONVINCES))]
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *_list_effects(equal))
-        return "EXPLAINED", (*prints, *there[0].effects)
-    left, before = (measure_excess(h.errors, floor) for h in (best, base))
-    better = min(left, 1e18) < ERROR_PARTLY_EXPLAINED**2 * before
-    if better and part:
+        return "EXPLAINED", (*prints, *explanations[0].effects)
+    excess, base_excess = (measure_excess(h.errors, floor) for h in (best, base))
+    is_better = min(excess, 1e18) < ERROR_PARTLY_EXPLAINED**2 * base_excess
+    if is_better and part:
         return "PARTLY", (*prints, *best.effects)
     return ("PARTLY" if prints else "UNEXPLAINED"), prints
 
@@ -498,8 +502,8 @@ def _judge_unseen_run(search: Search, h: Hypothesis, floor: Mapping[str, float])
     """Whether noise alone is left of the held-out run; if not of all of it, of what does not hang on a small stop."""
     if search.holdout is None:
         return HeldOut(True)
-    problem, (left,) = search.replay_holdout([h])
-    return _judge_run(problem, left, h, floor)
+    problem, (residuals,) = search.replay_holdout([h])
+    return _judge_run(problem, residuals, h, floor)
 
 
 def judge_left_out_rows(search: Search, h: Hypothesis, floor: Mapping[str, float]) -> Hypothesis:
@@ -510,29 +514,31 @@ def judge_left_out_rows(search: Search, h: Hypothesis, floor: Mapping[str, float
     if search.model.kind.correct is None:
         return h
     problem = search.make_problem(search.run, search.finest)
-    judged = _judge_run(problem, problem.compute_residuals(h.fit.free, h.fit.x[None])[0], h, floor)
-    return h if judged.holds else replace(h, ratio={s: max(x, judged.decided.get(s, 0.0) / floor[s])
-                                                    for s, x in h.ratio.items()})
+    outcome = _judge_run(problem, problem.compute_residuals(h.fit.free, h.fit.x[None])[0], h, floor)
+    return h if outcome.holds else replace(h, ratio={s: max(x, outcome.decided.get(s, 0.0) / floor[s])
+                                                     for s, x in h.ratio.items()})
 
 
-def _judge_run(problem: Problem, left: Floats, h: Hypothesis, floor: Mapping[str, float]) -> HeldOut:
-    """Whether noise alone is `left`, (s, n), of a run under a hypothesis, or of the rows that hang on no stop."""
-    if _is_noise(left, problem.trace, floor):
+def _judge_run(problem: Problem, residuals: Floats, h: Hypothesis, floor: Mapping[str, float]) -> HeldOut:
+    """Whether `residuals`, (s, n), of a run under a hypothesis are noise, or those of the rows that hang on no stop."""
+    if _is_noise(residuals, problem.trace, floor):
         return HeldOut(True)
-    undecided = find_undecided_rows(problem, h.fit, floor)
+    is_undecided = find_undecided_rows(problem, h.fit, floor)
     if problem.model.kind.correct is not None:  # a bounce that was missed has consequences
-        undecided |= find_unpredictable_rows(problem, replay_fit(problem, h.fit, h.fit.x), floor) & problem.trace.usable
-    elif not undecided.any():
+        is_undecided |= (find_unpredictable_rows(problem, replay_fit(problem, h.fit, h.fit.x), floor)
+                         & problem.trace.usable)
+    elif not is_undecided.any():
         return HeldOut(False)
-    share, kept = float(undecided.mean()), left[:, ~undecided]
+    share, rest = float(is_undecided.mean()), residuals[:, ~is_undecided]
     if share > HELD_OUT_UNDECIDED_SHARE:
         return HeldOut(False)
-    rms = np.sqrt(np.nanmean(kept**2, axis=1)).tolist()
-    return HeldOut(_is_noise(kept, problem.trace, floor), share, dict(zip(problem.trace.outputs, rms, strict=True)))
+    rms = np.sqrt(np.nanmean(rest**2, axis=1)).tolist()
+    return HeldOut(_is_noise(rest, problem.trace, floor), share, dict(zip(problem.trace.outputs, rms, strict=True)))
 
 
-def _is_noise(left: Floats, trace: Trace, floor: Mapping[str, float]) -> bool:
-    return all(e <= RESIDUAL_HELD_OUT * floor[s] for s, e in zip(trace.outputs, compute_typical_rms(left), strict=True))
+def _is_noise(residuals: Floats, trace: Trace, floor: Mapping[str, float]) -> bool:
+    return all(e <= RESIDUAL_HELD_OUT * floor[s]
+               for s, e in zip(trace.outputs, compute_typical_rms(residuals), strict=True))
 
 
 BUS_CURRENT, BUS_POSITION = 1e-8, 1e-7  # A, m: what one count on the bus is worth (docs/bus.md)
@@ -581,24 +587,24 @@ def find_marks(model: Model, traces: Sequence[Trace]) -> Marks:
     step, prints = comb.step if comb else 0.0, list[Fingerprint]()
     resolution, is_recorder = measure_firmware_resolution(model, traces[0]), False
     if comb and model.kind.controller:
-        left = find_controller_gain(model, traces[0].period)[0] * step
-        is_recorder = is_rounding_left(compute_firmware_residual(model, traces[0]), left, resolution)
-        resolution = float(np.hypot(resolution, left / np.sqrt(12.0))) if is_recorder else resolution
-    hidden = COMB_HIDDEN * model.nominal.get(model.kind.signals.controlled.noise, 0.0)
+        drive_step = find_controller_gain(model, traces[0].period)[0] * step
+        is_recorder = is_rounding_left(compute_firmware_residual(model, traces[0]), drive_step, resolution)
+        resolution = float(np.hypot(resolution, drive_step / np.sqrt(12.0))) if is_recorder else resolution
+    least_step = COMB_HIDDEN * model.nominal.get(model.kind.signals.controlled.noise, 0.0)
     is_offered = "quantisation" in {e.name for e in model.kind.list_effects()} - {*model.effects}
-    if comb and comb.step > hidden and not is_recorder and is_offered:
+    if comb and comb.step > least_step and not is_recorder and is_offered:
         sizes = {"quantisation.lsb": (step, step - comb.doubt, step + comb.doubt)}
         prints.append(Fingerprint("quantisation", sizes, step / FINEST_COMB, 0.0))
     error, firmware, unseen = 0.0, list[Fingerprint](), tuple[str, ...]()
     if model.kind.controller:
-        answer = _measure_rms(model, traces)
-        error = float(np.nan_to_num(answer / resolution))
-        offered = [e.name for e in model.kind.list_effects()
-                   if e.firmware and e.name not in model.effects and len(e.fitted) == 1
-                   and any(s[e.fitted[0]] != 0.0 for s in e.starts)]
-        tried = [_fit_size(model, traces, e, error, resolution) for e in offered if error > FIRMWARE_DIFFERS]
-        firmware = sorted((f for f in tried if f.after < 0.7 * error), key=lambda f: f.after)
-        unseen = tuple(offered) if np.isnan(answer) else ()
+        rms = _measure_rms(model, traces)
+        error = float(np.nan_to_num(rms / resolution))
+        names = [e.name for e in model.kind.list_effects()
+                 if e.firmware and e.name not in model.effects and len(e.fitted) == 1
+                 and any(s[e.fitted[0]] != 0.0 for s in e.starts)]
+        fingerprints = [_fit_size(model, traces, e, error, resolution) for e in names if error > FIRMWARE_DIFFERS]
+        firmware = sorted((f for f in fingerprints if f.after < 0.7 * error), key=lambda f: f.after)
+        unseen = tuple(names) if np.isnan(rms) else ()
     return Marks(error, resolution, (*prints, *firmware[:1]), step, is_recorder, tuple(firmware[1:]), unseen)
 
 
@@ -627,22 +633,22 @@ def compute_firmware_residual(model: Model, trace: Trace) -> Floats:
 
 def _measure_rms(model: Model, traces: Sequence[Trace]) -> float:
     """RMS of the firmware's residuals, A; NaN where it can be computed in none of the runs."""
-    left = [compute_firmware_residual(model, r) for r in traces]
-    return float(np.sqrt(np.mean([float(np.nanmean(x**2)) for x in left if not np.isnan(x).all()] or [np.nan])))
+    residuals = [compute_firmware_residual(model, r) for r in traces]
+    return float(np.sqrt(np.mean([float(np.nanmean(x**2)) for x in residuals if not np.isnan(x).all()] or [np.nan])))
 
 
 def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float, unit: float) -> Fingerprint:
     """The size of a firmware effect, of each sign that it starts with: logarithmic over all sizes, then ever closer."""
     entry = model.find_effect(name)
     parameter = entry.fitted[0]
-    ready, allowed = model.with_effects([name]), entry.parameters[parameter]
+    ready, quantity = model.with_effects([name]), entry.parameters[parameter]
     starts = [s[parameter] for s in entry.starts if s[parameter] != 0.0]
     span = np.log(min(map(abs, starts)) / 10.0), np.log(max(map(abs, starts)) * 10.0)
 
     def measure_error(size: float) -> float:
-        return np.inf if allowed.refuses(size) else _measure_rms(ready.replace({parameter: size}), traces) / unit
+        return np.inf if quantity.refuses(size) else _measure_rms(ready.replace({parameter: size}), traces) / unit
 
-    found = []
+    fingerprints = []
     for sign in sorted(set(np.sign(starts).tolist())):
         low, high = span
         for _ in range(6):  # each time closer around the best size
@@ -652,5 +658,5 @@ def _fit_size(model: Model, traces: Sequence[Trace], name: str, before: float, u
             low, high = sizes[max(k - 1, 0)], sizes[min(k + 1, SIZES - 1)]
         ends = sorted(sign * float(np.exp(s)) for s in (low, high))
         interval = sign * float(np.exp(sizes[k])), ends[0], ends[1]
-        found.append(Fingerprint(name, {parameter: interval}, before, errors[k], entry.firmware))
-    return min(found, key=lambda f: f.after)
+        fingerprints.append(Fingerprint(name, {parameter: interval}, before, errors[k], entry.firmware))
+    return min(fingerprints, key=lambda f: f.after)

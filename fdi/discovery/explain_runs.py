@@ -77,24 +77,25 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
             f"a plant with known balances; {UNBALANCED}")
     prepare_effects(runs, progress=progress)
     e = explain_recording(runs, progress)
-    is_left, law = e.verdict in PATTERN_VERDICTS, None
+    is_left, law_search = e.verdict in PATTERN_VERDICTS, None
     # the terms of laws are those of the reference model's balances
     if is_left and not e.base.is_at_floor and runs.model.kind.balances:
-        law = find_law_beside(e, progress)
+        law_search = find_law_beside(e, progress)
     progress("writing the answer", 0.97)
-    found = law.law if law is not None and law.law is not None and law.law.holds else None
+    law = law_search.law if law_search is not None and law_search.law is not None and law_search.law.holds else None
     file = effect_file or law_file
-    names = write_law_file(file, found.terms, found.values, found.reason) if found is not None and file else {}
+    names = write_law_file(file, law.terms, law.values, law.reason) if law is not None and file else {}
     shape = None
-    if can_balance(runs.model) and (is_left or (effect_file and found is None)):
+    if can_balance(runs.model) and (is_left or (effect_file and law is None)):
         shape = find_pattern(e.search, e.ledger[-1])
-        if effect_file and found is None:
+        if effect_file and law is None:
             write_effect(shape, effect_file)
     separation = find_separation(e.search, list_equal(e)) if e.verdict == "AMBIGUOUS" else None
     answer = assess_explanation(e, seed)
-    told = replace(answer, pattern=str(shape or UNBALANCED) if is_left else "",
-                   separate=separation._asdict() if separation else {}, law=law, law_effects=tuple(names.values()))
-    return told, shape
+    answer = replace(answer, pattern=str(shape or UNBALANCED) if is_left else "",
+                     separate=separation._asdict() if separation else {}, law=law_search,
+                     law_effects=tuple(names.values()))
+    return answer, shape
 
 
 def list_equal(e: Explanation) -> list[Hypothesis]:
@@ -116,22 +117,22 @@ def explain_recording(runs: Runs, progress: Progress = ignore_progress, rounds: 
     """
     if not can_be_cut(runs.est, runs.model):
         return explain(runs.model, runs.est, runs.repeats, runs.holdout, progress)
-    searched = [e.name for e in list_searched_effects(runs.model.plant) if e.port not in UNREPLAYED]
-    excerpt = choose_search_excerpt(runs.model, runs.est, searched, progress)
+    effects = [e.name for e in list_searched_effects(runs.model.plant) if e.port not in UNREPLAYED]
+    excerpt = choose_search_excerpt(runs.model, runs.est, effects, progress)
     whole = (runs.est, *runs.repeats)
     for _ in range(rounds):
         est, *repeats = (cut_excerpt(run, excerpt) for run in whole)
-        found = explain(runs.model, est, repeats, runs.holdout, progress, whole=whole)
-        said = found.ledger[-1]
+        explanation = explain(runs.model, est, repeats, runs.holdout, progress, whole=whole)
+        best = explanation.ledger[-1]
         more = None
-        if said.judgement is not None and not said.judgement.holds(found.floor):
-            more = said.judgement.find_worst_piece(found.floor, round(PIECE / runs.est.period), excerpt.pieces)
+        if best.judgement is not None and not best.judgement.holds(explanation.floor):
+            more = best.judgement.find_worst_piece(explanation.floor, round(PIECE / runs.est.period), excerpt.pieces)
         if more is None:
             break
-        fitted, excerpt = excerpt, make_excerpt([*excerpt.pieces, more])
+        fitted_excerpt, excerpt = excerpt, make_excerpt([*excerpt.pieces, more])
     else:
-        excerpt = fitted
-    return replace(found, excerpt=excerpt.describe(runs.est))
+        excerpt = fitted_excerpt
+    return replace(explanation, excerpt=excerpt.describe(runs.est))
 
 
 def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: Progress = ignore_progress) -> None:
@@ -150,18 +151,18 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
         with report_law_errors(whole_model):
             compile_kernels(whole_model, lambda stage, share: progress(stage, 0.0))
         return
-    replayed = [name for name in effects if runs.model.find_effect(name).port not in UNREPLAYED]
-    model = lean_model(runs.model, replayed)
+    replay_effects = [name for name in effects if runs.model.find_effect(name).port not in UNREPLAYED]
+    model = lean_model(runs.model, replay_effects)
     with report_law_errors(model):
         progress("compiling the plant with it, once", 0.0)
-        _compile_kernels(model, replayed)
+        _compile_kernels(model, replay_effects)
 
 
 def lean_model(model: Model, effects: Sequence[str]) -> Model:
     """The whole catalogue where its quick kernels have these effects; else a model of its own, worth its compiling."""
-    every, own = complete_model(model), silence_readings(model.with_effects(effects))
-    quick = {e for rung in list_kernel_variants(every)[:-1] for e in rung.model.effects}
-    return every if set(own.effects) <= quick else own
+    whole_model, own_model = complete_model(model), silence_readings(model.with_effects(effects))
+    quick = {e for rung in list_kernel_variants(whole_model)[:-1] for e in rung.model.effects}
+    return whole_model if set(own_model.effects) <= quick else own_model
 
 
 def _compile_kernels(model: Model, effects: Sequence[str]) -> None:
@@ -231,19 +232,19 @@ class Answer:
     @property
     def explanations(self) -> tuple[Candidate, ...]:
         """The candidates, each set of effects once, with the parameters of all its effects that are candidates."""
-        found: dict[frozenset[str], Candidate] = {}
+        explanations: dict[frozenset[str], Candidate] = {}
         for c in self.candidates:
             effects = frozenset((*c.beside, c.effect))
-            first = found.get(effects, c)
-            found[effects] = first._replace(parameters={**first.parameters, **c.parameters})
-        return tuple(found.values())
+            first = explanations.get(effects, c)
+            explanations[effects] = first._replace(parameters={**first.parameters, **c.parameters})
+        return tuple(explanations.values())
 
 
 def assess_explanation(e: Explanation, seed: int) -> Answer:
     """An explanation worked out; `seed` is that of the simulated runs behind the p-values."""
-    hand = [p for p in e.marks.prints if p.is_firmware]
+    firmware_prints = [p for p in e.marks.prints if p.is_firmware]
     baseline = {"error": dict(e.base.errors), "holdout": dict(e.holdout.get((), {})), "floor": dict(e.floor)}
-    if hand:
+    if firmware_prints:
         unit = e.marks.resolution
         drive = e.search.problem.trace.declared.drive.name
         baseline["error"][drive], baseline["floor"][drive] = e.marks.controller * unit, unit
@@ -252,24 +253,24 @@ def assess_explanation(e: Explanation, seed: int) -> Answer:
     noiseless = tuple(c.name for c in list_searched_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
     suspicious = tuple(list_suspicious(best, model.plant))
     return Answer(e, tuple(_list_candidates(e, seed)), baseline, e.hidden, noiseless, suspicious,
-                  tuple(_list_ledger(e, hand)))
+                  tuple(_list_ledger(e, firmware_prints)))
 
 
 def list_fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:
     """The parameters of an effect as fitted, with 95 % intervals within what is possible."""
-    found = {}
+    parameters = {}
     values, entry = limit_friction_values(fit.values), model.find_effect(effect)
     for f in fit.free:
         if f.name in entry.fitted:
             value = values[f.name]
             size = abs(value - entry.off.get(f.name, model.nominal.get(f.name, 0.0)))
             half = INTERVAL_95_SD * math.hypot(EFFECT_INTERVAL_FACTOR * fit.spread(f.name), EFFECT_SYSTEMATIC_SD * size)
-            found[f.name] = Value(value, min(max(f.low, value - half), value), max(min(f.high, value + half), value),
-                                  entry.parameters[f.name].unit)
-    for name, v in found.items():  # dynamic friction is not above static friction, nor is its interval
-        static = found.get(name.replace("dynamic", "static"), v)
-        found[name] = v._replace(high=max(min(v.high, static.high), v.value))
-    return found
+            parameters[f.name] = Value(value, min(max(f.low, value - half), value),
+                                       max(min(f.high, value + half), value), entry.parameters[f.name].unit)
+    for name, v in parameters.items():  # dynamic friction is not above static friction, nor is its interval
+        static = parameters.get(name.replace("dynamic", "static"), v)
+        parameters[name] = v._replace(high=max(min(v.high, static.high), v.value))
+    return parameters
 
 
 def list_suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
@@ -281,22 +282,22 @@ def list_suspicious(fit: Fit, plant: str = "eha") -> list[Suspicious]:
 
 def _list_candidates(e: Explanation, seed: int) -> list[Candidate]:
     """Each effect once, in the order of the explanations it is part of."""
-    found = {p.effect: _describe_mark(e, p) for p in e.marks.prints}
+    candidates = {p.effect: _describe_mark(e, p) for p in e.marks.prints}
     for rank, h in enumerate(e.ranked):
         for effect in h.effects if rank == 0 else h.effects[-1:]:
-            if effect not in found:
-                found[effect] = _describe_candidate(e, h, effect, seed)
-    return list(found.values())
+            if effect not in candidates:
+                candidates[effect] = _describe_candidate(e, h, effect, seed)
+    return list(candidates.values())
 
 
 def _describe_candidate(e: Explanation, h: Hypothesis, effect: str, seed: int) -> Candidate:
-    won, extra = measure_gain(e.base, h), _count_unknown(h.fit) - _count_unknown(e.base.fit)
+    gain, extra = measure_gain(e.base, h), _count_unknown(h.fit) - _count_unknown(e.base.fit)
     samples = sum(int(np.isfinite(run.measurements).sum()) for run in (e.search.problem.trace, *e.search.problem.also))
     charge = 0.5 * extra * math.log(samples) + len(h.effects) * math.log(max(len(e.search.effects), 1))
     values = list_fitted_parameters(effect, h.fit, e.search.problem.model)
     return Candidate(effect, tuple(x for x in h.effects if x != effect), values, dict(h.errors),
-                     dict(e.holdout.get(h.effects, {})), dict(h.ratio), 0.5 * won - charge,
-                     compute_p_value(e.blind, won, max(extra, 1), seed), _choose_word(e, h, effect))
+                     dict(e.holdout.get(h.effects, {})), dict(h.ratio), 0.5 * gain - charge,
+                     compute_p_value(e.blind, gain, max(extra, 1), seed), _choose_word(e, h, effect))
 
 
 def _count_unknown(fit: Fit) -> int:
@@ -311,8 +312,8 @@ def _choose_word(e: Explanation, h: Hypothesis, effect: str) -> str:
         return words[e.verdict]
     worst, before = max(h.ratio.values()), max(e.base.ratio.values())
     if worst <= RESIDUAL_IS_NOISE and not e.base.is_at_floor:
-        held = e.holdout.get(h.effects, {})
-        fails = any(error > RESIDUAL_HELD_OUT * e.floor[s] for s, error in held.items())
+        holdout = e.holdout.get(h.effects, {})
+        fails = any(error > RESIDUAL_HELD_OUT * e.floor[s] for s, error in holdout.items())
         return "fails on the held-out run" if fails else "less likely"
     return "part" if worst - 1.0 < ERROR_PARTLY_EXPLAINED * (before - 1.0) and not e.base.is_at_floor else "no"
 
@@ -327,21 +328,21 @@ def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:
         error[drive] = p.after * e.marks.resolution
         ratios = {drive: p.after}
     n = len(e.search.problem.trace)
-    won = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
-    evidence = won - 0.5 * len(values) * math.log(n) - math.log(len(CATALOGUE))
+    gain = n * math.log(max(p.before, 1.0) / max(p.after, 1.0))
+    evidence = gain - 0.5 * len(values) * math.log(n) - math.log(len(CATALOGUE))
     return Candidate(p.effect, (), values, error, dict(e.holdout.get((), {})), ratios, evidence,
-                     max(min(1.0, len(CATALOGUE) * math.exp(-min(won, 600.0))), 1e-300),
+                     max(min(1.0, len(CATALOGUE) * math.exp(-min(gain, 600.0))), 1e-300),
                      "explains" if p.effect in e.effects else "no")
 
 
-def _list_ledger(e: Explanation, hand: Sequence[Fingerprint]
+def _list_ledger(e: Explanation, firmware_prints: Sequence[Fingerprint]
             ) -> list[tuple[str | None, Mapping[str, float], Mapping[str, float]]]:
     unit, name = e.marks.resolution, e.search.problem.trace.declared.drive.name
-    drive = {name: e.marks.controller * unit} if hand else {}
+    drive = {name: e.marks.controller * unit} if firmware_prints else {}
     rows: list[tuple[str | None, Mapping[str, float], Mapping[str, float]]] = [
         (None, e.base.errors | drive, e.holdout.get((), {}))]
     for p in e.marks.prints:
         if p.effect in e.effects:
-            drive = {name: p.after * unit} if p in hand else drive
+            drive = {name: p.after * unit} if p in firmware_prints else drive
             rows.append((p.effect, e.base.errors | drive, e.holdout.get((), {})))
     return rows + [(h.effects[-1], h.errors | drive, e.holdout.get(h.effects, {})) for h in e.ledger[1:]]

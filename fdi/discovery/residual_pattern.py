@@ -60,16 +60,16 @@ class Pattern(NamedTuple):
         """In words."""
         if not self.place:
             return "what is left is too small to be seen as a force, a flow or a current"
-        said = f"{WORDS[self.place]}, {self.size:.4g} {self.unit} RMS"
+        text = f"{WORDS[self.place]}, {self.size:.4g} {self.unit} RMS"
         if self.wave:
             amplitude, length = self.wave[:2]
-            return (f"{said}; {100.0 * self.share:.0f} % of it is periodic in {self.state}: "
+            return (f"{text}; {100.0 * self.share:.0f} % of it is periodic in {self.state}: "
                     f"{amplitude:.4g} {self.unit} every {1e3 * length:.4g} m{STATES[self.state][0]}")
         if not self.state:
-            return f"{said}; it follows none of position, speed, pressure, spool, current or time alone"
+            return f"{text}; it follows none of position, speed, pressure, spool, current or time alone"
         unit, first, last, height = STATES[self.state][0], self.at[0], self.at[-1], self.height
         middle = float(np.interp(0.5 * (first + last), self.at, height))
-        return (f"{said}; {100.0 * self.share:.0f} % of it follows the {self.state}: "
+        return (f"{text}; {100.0 * self.share:.0f} % of it follows the {self.state}: "
                 f"{height[0]:.4g} {self.unit} at {first:.3g} {unit}, {middle:.4g} in the middle, "
                 f"{height[-1]:.4g} at {last:.3g} {unit}")
 
@@ -77,28 +77,28 @@ class Pattern(NamedTuple):
 def find_pattern(search: Search, h: Hypothesis) -> Pattern:
     """The shape of what a hypothesis leaves unexplained."""
     (best, *_), states = compute_balances(search.problem, h, search.estimate_floor(h))
-    pumped = best.place == "flow" and "pump.displacement" in search.problem.model.values
-    port = PUMPED if pumped else PORTS[best.place]
+    is_pump_flow = best.place == "flow" and "pump.displacement" in search.problem.model.values
+    port = PUMPED if is_pump_flow else PORTS[best.place]
     if best.ratio < PATTERN_VISIBLE_RATIO:
         none = np.empty(0)
         return Pattern("", "", 0.0, "", 0.0, none, none, none, None, best.missing, port)
     missing = best.missing[EDGE:-EDGE]
-    seen = {name: x for name in CAUSES[best.place] if np.ptp(x := getattr(states, name)[EDGE:-EDGE]) > 0.0}
-    curves = {name: fit_curve(missing, x, best.noise) for name, x in seen.items()}
+    causes = {name: x for name in CAUSES[best.place] if np.ptp(x := getattr(states, name)[EDGE:-EDGE]) > 0.0}
+    curves = {name: fit_curve(missing, x, best.noise) for name, x in causes.items()}
     state, wave = max(curves, key=lambda n: curves[n][0]), None
     share, at, height, doubt = curves[state]
-    waves = {name: fit_wave(missing, seen[name], best.noise) for name in ("position", "time")}
-    over = max(waves, key=lambda n: waves[n][1])
-    if waves[over][1] > max(share + 0.05, PATTERN_EXPLAINED_SHARE):
-        state, (wave, share) = over, waves[over]
-        _, at, height, doubt = fit_curve(missing, np.mod(seen[over], wave[1]), best.noise)
+    waves = {name: fit_wave(missing, causes[name], best.noise) for name in ("position", "time")}
+    wave_state = max(waves, key=lambda n: waves[n][1])
+    if waves[wave_state][1] > max(share + 0.05, PATTERN_EXPLAINED_SHARE):
+        state, (wave, share) = wave_state, waves[wave_state]
+        _, at, height, doubt = fit_curve(missing, np.mod(causes[wave_state], wave[1]), best.noise)
     elif share < PATTERN_EXPLAINED_SHARE:
         state = ""
     return Pattern(best.place, best.unit, best.size, state, share, at, height, doubt, wave, best.missing, port)
 
 
-def is_periodic_in_position(search: Search, base: Hypothesis, found: Hypothesis) -> bool:
-    """Whether a force that repeats along the stroke explains more of what the base leaves than the found effects do.
+def is_periodic_in_position(search: Search, base: Hypothesis, best: Hypothesis) -> bool:
+    """Whether a force that repeats along the stroke explains more of what the base leaves than the effects of `best`.
 
     Teeth, magnets and a bent rod make such a force. A friction law that fits its mean at each speed helps a little, on
     every run, and is then named for it.
@@ -109,13 +109,13 @@ def is_periodic_in_position(search: Search, base: Hypothesis, found: Hypothesis)
     force = next((b for b in balances if b.place == "force"), None)
     if force is None or force.ratio < PATTERN_VISIBLE_RATIO:
         return False
-    others, _ = compute_balances(search.problem, found, search.estimate_floor(found))
-    left = next(b for b in others if b.place == "force")
-    taken = 1.0 - (left.size / force.size) ** 2 if force.size else 1.0
+    best_balances, _ = compute_balances(search.problem, best, search.estimate_floor(best))
+    residual_force = next(b for b in best_balances if b.place == "force")
+    effect_share = 1.0 - (residual_force.size / force.size) ** 2 if force.size else 1.0
     inner = slice(EDGE, -EDGE)
     (_, length, _), share = fit_wave(force.missing[inner], states.position[inner], force.noise)
     turns = float(np.ptp(states.position[inner])) / length
-    return turns >= SPATIAL_TURNS and share >= PATTERN_EXPLAINED_SHARE and share > taken
+    return turns >= SPATIAL_TURNS and share >= PATTERN_EXPLAINED_SHARE and share > effect_share
 
 
 def fit_curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats, Floats]:
@@ -128,16 +128,16 @@ def fit_curve(y: Floats, x: Floats, noise: float) -> tuple[float, Floats, Floats
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
     count = np.bincount(place, minlength=len(edges) - 1)
     fewest_in_bin = 20  # samples in a bin
-    kept = count >= fewest_in_bin
+    has_enough = count >= fewest_in_bin
     total = np.bincount(place, y, len(count))
-    at = np.bincount(place, x, len(count))[kept] / count[kept]
-    height = total[kept] / count[kept]
-    spread = np.sqrt(np.maximum(np.bincount(place, y * y, len(count))[kept] / count[kept] - height**2, 0.0))
-    there = kept[place]
-    left = y[there] - np.interp(x[there], at, height)
-    whole = float(np.mean(y[there] ** 2)) - noise**2
-    share = 1.0 - max(float(np.mean(left**2)) - noise**2, 0.0) / max(whole, 1e-300)
-    return max(share, 0.0), at, height, spread / np.sqrt(count[kept])
+    at = np.bincount(place, x, len(count))[has_enough] / count[has_enough]
+    height = total[has_enough] / count[has_enough]
+    spread = np.sqrt(np.maximum(np.bincount(place, y * y, len(count))[has_enough] / count[has_enough] - height**2, 0.0))
+    is_binned = has_enough[place]
+    residual = y[is_binned] - np.interp(x[is_binned], at, height)
+    whole = float(np.mean(y[is_binned] ** 2)) - noise**2
+    share = 1.0 - max(float(np.mean(residual**2)) - noise**2, 0.0) / max(whole, 1e-300)
+    return max(share, 0.0), at, height, spread / np.sqrt(count[has_enough])
 
 
 def fit_wave(y: Floats, x: Floats, noise: float) -> tuple[tuple[float, float, float], float]:
@@ -157,10 +157,10 @@ def fit_wave(y: Floats, x: Floats, noise: float) -> tuple[tuple[float, float, fl
         best = near[int(np.argmax(lombscargle(x, y - y.mean(), 2.0 * np.pi * near / span)))]
     turn = 2.0 * np.pi * best / span
     basis = np.column_stack([np.sin(turn * x), np.cos(turn * x), np.ones_like(x)])
-    found = np.linalg.lstsq(basis, y, rcond=None)[0]
-    left = float(np.mean((y - basis @ found) ** 2)) - noise**2
-    share = 1.0 - max(left, 0.0) / max(float(np.mean(y**2)) - noise**2, 1e-300)
-    return (float(np.hypot(found[0], found[1])), span / best, float(np.arctan2(found[1], found[0]))), share
+    wave = np.linalg.lstsq(basis, y, rcond=None)[0]
+    excess = float(np.mean((y - basis @ wave) ** 2)) - noise**2
+    share = 1.0 - max(excess, 0.0) / max(float(np.mean(y**2)) - noise**2, 1e-300)
+    return (float(np.hypot(wave[0], wave[1])), span / best, float(np.arctan2(wave[1], wave[0]))), share
 
 
 def write_effect(p: Pattern, path: str | Path, name: str = "discovered") -> None:
@@ -252,30 +252,30 @@ def compute_balances(problem: Problem, h: Hypothesis, floor: Mapping[str, float]
     names = [f.name for f in h.fit.free]
     values = {**problem.model.values, **h.fit.values}
     replay = problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
-    measured = replay.copy()
+    measurement = replay.copy()
     columns = trace.output_columns
-    measured[columns] = np.where(np.isnan(trace.measurements), replay[columns], trace.measurements)
+    measurement[columns] = np.where(np.isnan(trace.measurements), replay[columns], trace.measurements)
     before = np.concatenate([[0.0], trace.drive[:-1]])
     period = problem.model.values["controller.period"]
     compute = partial(_compute_terms, current=before, load=trace.load, p=values, period=period)
-    own, seen = compute(replay), compute(measured)
+    replay_terms, measured_terms = compute(replay), compute(measurement)
     level = [floor.get(s, 0.0) for s in trace.output_names]
     rng = np.random.default_rng(0)
     draws = 4  # simulated runs without anything missing
-    kept = find_smooth_rows(trace)
+    is_usable = find_smooth_rows(trace)
     noisy = [compute(replay + rng.standard_normal(replay.shape) * np.array(level)[:, None]) for _ in range(draws)]
-    smooth = np.logical_and.reduce([find_followed_rows(x, noise) for x, noise in zip(measured, level, strict=True)])
-    found = []
-    for place in own:
-        missing = (seen[place] - own[place])[kept]
-        noise = float(np.sqrt(np.mean([_mean_square((n[place] - own[place])[kept]) for n in noisy])))
+    smooth = np.logical_and.reduce([find_followed_rows(x, noise) for x, noise in zip(measurement, level, strict=True)])
+    balances = []
+    for place in replay_terms:
+        missing = (measured_terms[place] - replay_terms[place])[is_usable]
+        noise = float(np.sqrt(np.mean([_mean_square((n[place] - replay_terms[place])[is_usable]) for n in noisy])))
         rms = float(np.sqrt(_mean_square(missing)))
-        found.append(Balance(place, UNITS[place], missing, noise, rms / noise if noise else 0.0, smooth[kept]))
-    position, speed = _smooth(measured[0], SPEED_WINDOW), _measure_speed(measured[0], period)
-    states = (position, speed, measured[1], measured[2], before, trace.t, _measure_speed(measured[2], period),
+        balances.append(Balance(place, UNITS[place], missing, noise, rms / noise if noise else 0.0, smooth[is_usable]))
+    position, speed = _smooth(measurement[0], SPEED_WINDOW), _measure_speed(measurement[0], period)
+    states = (position, speed, measurement[1], measurement[2], before, trace.t, _measure_speed(measurement[2], period),
               trace.command, np.clip(speed / CREEP, -1.0, 1.0), measure_way(position, speed),
-              _smooth(measured[0], ACCELERATION_WINDOW, deriv=2, delta=period))
-    return sorted(found, key=lambda b: -b.ratio), States(*(x[kept] for x in states))
+              _smooth(measurement[0], ACCELERATION_WINDOW, deriv=2, delta=period))
+    return sorted(balances, key=lambda b: -b.ratio), States(*(x[is_usable] for x in states))
 
 
 def find_followed_rows(x: Floats, noise: float, share: float = 0.03) -> Flags:
@@ -302,11 +302,11 @@ def find_smooth_rows(trace: Trace) -> Flags:
     """All rows; of an excerpt those that smoothing does not carry across a joint, and that are compared at all."""
     if not trace.parts:
         return np.ones(len(trace), bool)
-    kept = trace.usable.copy()
+    is_usable = trace.usable.copy()
     for part in trace.parts:
-        kept[part.first:part.first + EDGE] = False
-        kept[part.stop - EDGE:part.stop] = False
-    return kept
+        is_usable[part.first:part.first + EDGE] = False
+        is_usable[part.stop - EDGE:part.stop] = False
+    return is_usable
 
 
 def _mean_square(x: Floats) -> float:

@@ -56,25 +56,25 @@ def read_runs(model: Model, trace: str | Trace, repeats: Sequence[str | Trace] =
     unseen = None if holdout is None else _prepare_holdout(est, traces[-1], model, names[0], names[-1])
     doubt = ""
     if others and model.kind.controller:  # an error of the model is the same in all of them and does not matter here
-        first, *left = (compute_residuals(run, replay_current(run, model)) for run in (est, *others))
-        doubt = describe_doubtful_repeats(find_floors(first, left, est.period), sensor_floors(est, model),
+        first, *repeat_residuals = (compute_residuals(run, replay_current(run, model)) for run in (est, *others))
+        doubt = describe_doubtful_repeats(find_floors(first, repeat_residuals, est.period), sensor_floors(est, model),
                                           est.declared)
     alike = ("the held-out run has the command of the run: it shows overfitting less than another command"
              if unseen is not None and has_same_command(est, unseen) else "")
     return Runs(model, est, others, unseen, tuple(sources), (*est.notes, *filter(None, (doubt, alike))))
 
 
-def read_traces(given: Sequence[str | Trace], model: Model) -> tuple[list[Trace], list[Source]]:
+def read_traces(runs: Sequence[str | Trace], model: Model) -> tuple[list[Trace], list[Source]]:
     """Traces of the plant of a model, those that are files read, and where they come from.
 
     Raises:
         InputError: a file that cannot be used.
     """
     sources = [Source(each.provenance.get("source", "trace"), _hash_columns(each)) if isinstance(each, Trace)
-               else read_source(each) for each in given]
-    traces = [each if isinstance(each, Trace) else Trace.read(each, signals=model.kind.signals) for each in given]
-    if any(isinstance(each, Trace) for each in given):  # it may have been read from a file that is given beside it
-        files = {_hash_columns(trace): source.sha256 for each, trace, source in zip(given, traces, sources, strict=True)
+               else read_source(each) for each in runs]
+    traces = [each if isinstance(each, Trace) else Trace.read(each, signals=model.kind.signals) for each in runs]
+    if any(isinstance(each, Trace) for each in runs):  # it may have been read from a file that is given beside it
+        files = {_hash_columns(trace): source.sha256 for each, trace, source in zip(runs, traces, sources, strict=True)
                  if not isinstance(each, Trace)}
         sources = [source._replace(sha256=files.get(source.sha256, source.sha256)) for source in sources]
     return traces, sources
@@ -99,24 +99,24 @@ def read_source(file: str) -> Source:
         raise InputError(file, "", f"a trace that can be read ({error.strerror})") from error
 
 
-def require_distinct(sources: Sequence[Source], first: str, expected: str, count: int) -> None:
+def require_distinct(sources: Sequence[Source], first: str, expectation: str, count: int) -> None:
     """Refuse a run that stands in for itself: it would prove whatever is asked of it.
 
     Args:
         sources: of the runs to fit, then of the held-out ones.
         first: where a run to fit was named, for the message.
-        expected: what it should be.
+        expectation: what it should be.
         count: of the runs to fit.
 
     Raises:
         InputError: a run that is given twice.
     """
-    seen: dict[str, str] = {}
+    files: dict[str, str] = {}
     for number, (file, content) in enumerate(sources):
-        if content in seen:
-            place, words = (first, expected) if number < count else ("--holdout", "a run that no fit has seen")
-            raise InputError(place, file, f"{words}; this is {seen[content]} itself")
-        seen[content] = file
+        if content in files:
+            place, words = (first, expectation) if number < count else ("--holdout", "a run that no fit has seen")
+            raise InputError(place, file, f"{words}; this is {files[content]} itself")
+        files[content] = file
 
 
 def _prepare_run(trace: Trace, model: Model, outputs: Sequence[str] | None, source: str) -> Trace:
@@ -135,11 +135,11 @@ def _prepare_repeat(est: Trace, trace: Trace, model: Model, source: str, number:
     return find_repeat(est, trace, model, number)
 
 
-def _prepare_holdout(est: Trace, trace: Trace, model: Model, fitted: str, source: str) -> Trace:
+def _prepare_holdout(est: Trace, trace: Trace, model: Model, est_source: str, source: str) -> Trace:
     """The held-out run, with those of the run's outputs that it has."""
     outputs = [s for s in est.outputs if s in trace.signals]
     unseen = _prepare_run(trace, model, outputs or est.outputs, source)
     period = model["controller.period"]
     require(match_period(model, unseen, SAME_PERIOD)["controller.period"] == period, source, "t",
-            f"rows {period:g} s apart, as in {fitted}")
+            f"rows {period:g} s apart, as in {est_source}")
     return unseen

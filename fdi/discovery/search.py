@@ -210,87 +210,87 @@ class Search:
 
         Near its end a fit steps over ridges by luck: what is left there without the effect is not the effect's gain.
         """
-        left = replay_fit(self.fine or self.problem, base.fit, _place_base(base, h))
-        return min(base, self.judge_fit((), left), key=lambda each: each.cost)
+        fit = replay_fit(self.fine or self.problem, base.fit, _place_base(base, h))
+        return min(base, self.judge_fit((), fit), key=lambda each: each.cost)
 
     def list_further_effects(self, present: Sequence[str]) -> list[str]:
         """The effects of the search that may stand beside these."""
         return list_compatible_effects(self.model, self.effects, present)
 
-    def add_each_effect(self, start: Hypothesis, fitted: int = FITTED) -> list[Hypothesis]:
+    def add_each_effect(self, start: Hypothesis, fit_count: int = FITTED) -> list[Hypothesis]:
         """`start` with one more effect: the promising ones fitted, best first."""
         effects = self.list_further_effects(start.effects)
-        begun = [start.fit]
+        start_fits = [start.fit]
         if not start.effects:  # a fit that had to do without a large effect may sit in a wrong basin
-            begun.append(linearise(self.problem, start.fit.free, np.zeros(len(start.fit.free))))
-        prospects = scan_effects(self.problem, begun, effects, self.workers)
-        worth = [p for p in prospects if p.cost < start.cost - GAIN_WORTH_A_FIT][:fitted]
-        fits = list(zip([p.effect for p in worth], self.map_parallel(self._begin_fit, worth), strict=True))
-        for rounds, kept in RACE:
+            start_fits.append(linearise(self.problem, start.fit.free, np.zeros(len(start.fit.free))))
+        prospects = scan_effects(self.problem, start_fits, effects, self.workers)
+        prospects = [p for p in prospects if p.cost < start.cost - GAIN_WORTH_A_FIT][:fit_count]
+        fits = list(zip([p.effect for p in prospects], self.map_parallel(self._begin_fit, prospects), strict=True))
+        for rounds, count in RACE:
             fits.sort(key=lambda each: each[1].cost)
-            fits[:kept] = self.map_parallel(partial(self._continue_begun_fit, rounds), fits[:kept])
-        ranked = sorted(self.map_parallel(lambda each: self.judge_fit((*start.effects, each[0]), each[1]), fits),
-                        key=lambda h: h.cost)
-        if ranked and not ranked[0].is_at_floor:
-            x = ranked[0].fit.x
-            has_prior = np.array([np.isfinite(f.prior) for f in ranked[0].fit.free])
-            ranked[0] = self.retry_from(ranked[0], [np.where(has_prior & (np.abs(x) > 1.0), 0.0, x)])
-        return ranked
+            fits[:count] = self.map_parallel(partial(self._continue_begun_fit, rounds), fits[:count])
+        hypotheses = sorted(self.map_parallel(lambda each: self.judge_fit((*start.effects, each[0]), each[1]), fits),
+                            key=lambda h: h.cost)
+        if hypotheses and not hypotheses[0].is_at_floor:
+            x = hypotheses[0].fit.x
+            has_prior = np.array([np.isfinite(f.prior) for f in hypotheses[0].fit.free])
+            hypotheses[0] = self.retry_from(hypotheses[0], [np.where(has_prior & (np.abs(x) > 1.0), 0.0, x)])
+        return hypotheses
 
-    def add_each_in_place(self, start: Hypothesis, rounds: int, fitted: int = 4) -> list[Hypothesis]:
+    def add_each_in_place(self, start: Hypothesis, rounds: int, fit_count: int = 4) -> list[Hypothesis]:
         """`start` with one more effect each, in place of the tolerances that are far off; best first.
 
         An effect that does what a tolerance does gains only the square of that, which no forecast from afar sees: the
         valley is narrow and bends. So the tolerances are taken back to a healthy unit in eighths, and the effect and
         the rest are fitted at each. Only what that leads to is fitted with the finest steps.
         """
-        problem, own = self.problem, {f.name: f for f in start.fit.free}
+        problem, unknowns = self.problem, {f.name: f for f in start.fit.free}
         far = {f.name: start.fit.values[f.name] for f, x in zip(start.fit.free, start.fit.x, strict=True)
                if abs(x) > UNUSUAL_SD * f.prior}
 
         def hold(free: Sequence[Free], share: float) -> list[Free]:
-            return [f._replace(centre=own[f.name].centre + share * (far[f.name] - own[f.name].centre), prior=1e-6)
-                    if f.name in far and np.isfinite(f.prior) else f for f in free]
+            return [f._replace(centre=unknowns[f.name].centre + share * (far[f.name] - unknowns[f.name].centre),
+                               prior=1e-6) if f.name in far and np.isfinite(f.prior) else f for f in free]
 
-        free, x = hold(start.fit.free, TAKEN_BACK[0]), np.where([name in far for name in own], 0.0, start.fit.x)
-        begun = linearise(problem, free, x)
+        free, x = hold(start.fit.free, TAKEN_BACK[0]), np.where([name in far for name in unknowns], 0.0, start.fit.x)
+        first_fit = linearise(problem, free, x)
         cost = problem.compute_costs(start.fit.free, start.fit.x[None])[0]  # of `start`, with these steps
-        prospects = scan_effects(problem, [begun], self.list_further_effects(start.effects), self.workers)
+        prospects = scan_effects(problem, [first_fit], self.list_further_effects(start.effects), self.workers)
 
-        def linearise_here(now: Fit) -> Fit:
-            return linearise(problem, now.free, now.x)
+        def linearise_here(fit: Fit) -> Fit:
+            return linearise(problem, fit.free, fit.x)
 
         def fit_in_place(p: Prospect) -> Hypothesis:
-            before = np.array([(begun.values.get(f.name, f.centre) - f.centre) / f.scale for f in p.free])
+            before = np.array([(first_fit.values.get(f.name, f.centre) - f.centre) / f.scale for f in p.free])
             at = p.x
             for share in TAKEN_BACK:
                 ahead = np.clip(2.0 * at - before, *scaled_bounds(p.free))
                 fit = start_fit(hold(p.free, share), ahead)
                 before, at = at, take_steps(problem, fit, linearise_here, 2, NO_STAGE, take_curved_step).x
-            free = [own.get(f.name, f) if np.isfinite(f.prior) else f for f in p.free]
-            there = linearise(problem, free, at)
-            if there.cost < cost + GAIN_DOUBTFUL:
-                there = finish_fit(self.fine or problem, there, rounds, problem, take_step=take_curved_step)
-            return self.judge_fit((*start.effects, p.effect), there)
+            free = [unknowns.get(f.name, f) if np.isfinite(f.prior) else f for f in p.free]
+            last_fit = linearise(problem, free, at)
+            if last_fit.cost < cost + GAIN_DOUBTFUL:
+                last_fit = finish_fit(self.fine or problem, last_fit, rounds, problem, take_step=take_curved_step)
+            return self.judge_fit((*start.effects, p.effect), last_fit)
 
-        worth = [p for p in prospects if p.cost < begun.cost - GAIN_WORTH_A_FIT][:fitted]
-        return sorted(self.map_parallel(fit_in_place, worth), key=lambda h: h.cost)
+        prospects = [p for p in prospects if p.cost < first_fit.cost - GAIN_WORTH_A_FIT][:fit_count]
+        return sorted(self.map_parallel(fit_in_place, prospects), key=lambda h: h.cost)
 
-    def add_each_with_more_noise(self, start: Hypothesis, tried: Sequence[Hypothesis], fitted: int = 6
+    def add_each_with_more_noise(self, start: Hypothesis, hypotheses: Sequence[Hypothesis], fit_count: int = 6
                                  ) -> list[Hypothesis]:
         """`start` with one more effect each, chosen and fitted with the noise first taken for larger; best first.
 
         Where the fit of `start` has ended in a local minimum, a scan believes what that fit tells it, and fits begin
         there. With more noise the tolerances stay near a healthy unit, and an effect is judged by the course of the
-        signals. The best two effects that have been `tried` are fitted in any case.
+        signals. The effects of the best two `hypotheses`, tried before, are fitted in any case.
         """
         loud = scale_noise(self.problem, EASED[0])
-        begun = fit_unknowns(loud, start.fit.free, place_in_healthy_unit(start.fit.free, start.fit.x), 4)
-        prospects = scan_effects(loud, [begun], self.list_further_effects(start.effects), self.workers)
-        known = {h.effects[-1] for h in tried[:2]}
+        loud_fit = fit_unknowns(loud, start.fit.free, place_in_healthy_unit(start.fit.free, start.fit.x), 4)
+        prospects = scan_effects(loud, [loud_fit], self.list_further_effects(start.effects), self.workers)
+        best_effects = {h.effects[-1] for h in hypotheses[:2]}
         least = GAIN_WORTH_A_FIT / EASED[0] ** 2  # gains shrink with the square of the noise
-        starts = [p for rank, p in enumerate(p for p in prospects if p.cost < begun.cost - least)
-                  if rank < fitted or p.effect in known]
+        starts = [p for rank, p in enumerate(p for p in prospects if p.cost < loud_fit.cost - least)
+                  if rank < fit_count or p.effect in best_effects]
 
         def begin_eased(p: Prospect) -> tuple[str, Fit]:
             x = self.find_eased_start(p.free, place_in_healthy_unit(p.free, p.x))
@@ -309,33 +309,33 @@ class Search:
         has_prior = np.isfinite([f.prior for f in free])
         home = np.where(has_prior, 0.0, h.fit.x)
         coarse = self.make_problem(self.problem.trace, Problem.steps)  # enough for what leads to a valley
-        begun = fit_unknowns(scale_noise(coarse, 100.0), free, home, 4)
-        width = np.where(has_prior, 0.5, 0.1 * np.maximum(np.abs(begun.x), 0.1))
+        start = fit_unknowns(scale_noise(coarse, 100.0), free, home, 4)
+        width = np.where(has_prior, 0.5, 0.1 * np.maximum(np.abs(start.x), 0.1))
         end = follow_population(
-            coarse, begun, np.diag(width**2), VALLEY_STAGES, 0,
+            coarse, start, np.diag(width**2), VALLEY_STAGES, 0,
             lambda problem, fit, rounds, factor: fit_unknowns(scale_noise(problem, factor), free, fit.x, rounds))
         other = self.judge_fit(h.effects, fit_unknowns(self.problem, free, end.x))
         return min(h, other, key=lambda each: each.cost + each.repeat_cost)
 
     def drop_each_effect(self, h: Hypothesis) -> list[Hypothesis]:
         """The hypothesis with one of its effects taken out, each of them, fitted from where it is; best first."""
-        def fit_without(gone: str) -> Hypothesis:
-            kept, begun = self._place_without(h.fit, gone)
-            x = np.array([begun, *(self._place_without(there, gone)[1] for there in self._list_ways_off(h.fit, gone))])
-            best = x[int(np.argmin(self.problem.compute_costs(kept, x)))] if len(x) > 1 else x[0]
-            return self.judge_fit(tuple(e for e in h.effects if e != gone), fit_unknowns(self.problem, kept, best))
+        def fit_without(effect: str) -> Hypothesis:
+            free, start = self._place_without(h.fit, effect)
+            x = np.array([start, *(self._place_without(fit, effect)[1] for fit in self._list_ways_off(h.fit, effect))])
+            best = x[int(np.argmin(self.problem.compute_costs(free, x)))] if len(x) > 1 else x[0]
+            return self.judge_fit(tuple(e for e in h.effects if e != effect), fit_unknowns(self.problem, free, best))
 
         return sorted(self.map_parallel(fit_without, h.effects), key=lambda each: each.cost)
 
     def _place_without(self, fit: Fit, effect: str) -> tuple[list[Free], Floats]:
         """The unknowns of a fit without those of an effect, and where they are, (p,): at 0 its own ones at a bound."""
         usual = {f.name: f for f in list_all_unknowns(self.model)}
-        own, values = set(self.model.find_effect(effect).fitted), fit.values
-        free = [usual.get(f.name) if f.name in own else f for f in fit.free]
-        kept = [f for f in free if f is not None]
-        x = [(values[f.name] - f.centre) / f.scale if f.name not in own or f.low < values[f.name] < f.high else 0.0
-             for f in kept]
-        return kept, np.clip(x, *scaled_bounds(kept))
+        names, values = set(self.model.find_effect(effect).fitted), fit.values
+        unknowns = [usual.get(f.name) if f.name in names else f for f in fit.free]
+        free = [f for f in unknowns if f is not None]
+        x = [(values[f.name] - f.centre) / f.scale if f.name not in names or f.low < values[f.name] < f.high else 0.0
+             for f in free]
+        return free, np.clip(x, *scaled_bounds(free))
 
     def _list_ways_off(self, fit: Fit, effect: str) -> list[Fit]:
         """The fit where an effect is off and other parameters have taken its place, along directions no signal shows.
@@ -343,14 +343,14 @@ class Search:
         entry = self.model.find_effect(effect)
         x = [scale_to(fit.free, fit.x, direction.powers, name, entry.off[name])
              for direction in list_directions(self.problem, fit.values) for name in entry.fitted if name in entry.off]
-        return [replace(fit, x=there) for there in x if there is not None]
+        return [replace(fit, x=row) for row in x if row is not None]
 
     def map_parallel(self, do: Callable[[T], R], items: Iterable[T]) -> list[R]:
         """In threads whose replays are made together: side by side in the lanes of a kernel."""
         def do_step(item: T) -> R:
-            found = do(item)
+            answer = do(item)
             self.stage.finish_step()
-            return found
+            return answer
 
         return map_together(do_step, items, self.workers)
 
@@ -359,30 +359,30 @@ class Search:
 
     def _begin_fit(self, p: Prospect) -> Fit:
         """Begin at the scan's linear forecast, or with all but the effect left where it was, if that is better."""
-        own = np.isin([f.name for f in p.free], self.model.find_effect(p.effect).fitted)
-        starts = np.array([p.x, np.where(own, p.x, 0.0)])
+        is_own = np.isin([f.name for f in p.free], self.model.find_effect(p.effect).fitted)
+        starts = np.array([p.x, np.where(is_own, p.x, 0.0)])
         return linearise(self.problem, p.free, starts[int(np.argmin(self.problem.compute_costs(p.free, starts)))])
 
-    def judge_fit(self, effects: tuple[str, ...], found: Fit, others: Sequence[Floats] = ()) -> Hypothesis:
+    def judge_fit(self, effects: tuple[str, ...], fit: Fit, others: Sequence[Floats] = ()) -> Hypothesis:
         """What a fit leaves, on its own run and on the repeats: `others`, (s, n) SI each, where that is known."""
         signals = self.problem.trace.outputs
-        own = found.residuals[:, :len(self.problem.trace)]  # the first run of a fit to several
-        errors = _measure_rms(own, signals)
+        residuals = fit.residuals[:, :len(self.problem.trace)]  # the first run of a fit to several
+        errors = _measure_rms(residuals, signals)
         coarse = [self.coarse.get(s, 0.0) for s in signals]
-        others = others or [p.compute_residuals(found.free, found.x[None])[0] for p in self.repeats]
+        others = others or [p.compute_residuals(fit.free, fit.x[None])[0] for p in self.repeats]
         floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
         if not others:
-            errors = measure_decided_errors(self.problem, found, floor)
-            return Hypothesis(effects, found, errors, {s: errors[s] / floor[s] for s in signals})
+            errors = measure_decided_errors(self.problem, fit, floor)
+            return Hypothesis(effects, fit, errors, {s: errors[s] / floor[s] for s in signals})
         pairs = zip(self.repeats, others, strict=True)
         cost = float(np.mean([compute_misfit(p.whiten_residuals(r[None]))[0] for p, r in pairs]))
-        ratio = dict(zip(signals, measure_repeating(own, others, coarse), strict=True))
+        ratio = dict(zip(signals, measure_repeating(residuals, others, coarse), strict=True))
         if self.model.kind.correct is not None and max(ratio.values()) > RESIDUAL_IS_NOISE:
-            undecided = find_undecided_rows(replace(self.problem, also=(), _lanes={}), found, floor)
-            typical = _leave_out_worst(np.where(undecided, np.nan, own))
+            is_undecided = find_undecided_rows(replace(self.problem, also=(), _lanes={}), fit, floor)
+            typical = _leave_out_worst(np.where(is_undecided, np.nan, residuals))
             if not np.isnan(typical).all(axis=1).any():
                 ratio = dict(zip(signals, measure_repeating(typical, others, coarse), strict=True))
-        return Hypothesis(effects, found, errors, ratio, cost, tuple(others))
+        return Hypothesis(effects, fit, errors, ratio, cost, tuple(others))
 
     def make_problem(self, trace: Trace, steps: int) -> Problem:
         """One run, with so many steps a cycle, in place of all that the search fits; it may lack signals of theirs."""
@@ -395,22 +395,22 @@ class Search:
         assert self.holdout is not None
         problem = self.make_problem(self.holdout, FINE if is_long(self.holdout) else self.finest)
         new = [h for h in dict.fromkeys(hypotheses) if h not in self._left_unseen]
-        left = map_together(lambda h: problem.compute_residuals(h.fit.free, h.fit.x[None])[0], new, self.workers)
-        self._left_unseen.update(zip(new, left, strict=True))
+        residuals = map_together(lambda h: problem.compute_residuals(h.fit.free, h.fit.x[None])[0], new, self.workers)
+        self._left_unseen.update(zip(new, residuals, strict=True))
         return problem, [self._left_unseen[h] for h in hypotheses]
 
     def measure_holdout(self, hypotheses: Sequence[Hypothesis]) -> list[dict[str, float]]:
         """RMS residuals on the run that no fit saw, SI units; {} without one."""
         if self.holdout is None:
             return [{} for _ in hypotheses]
-        return [_measure_rms(left, self.holdout.outputs) for left in self.replay_holdout(hypotheses)[1]]
+        return [_measure_rms(residuals, self.holdout.outputs) for residuals in self.replay_holdout(hypotheses)[1]]
 
     def measure_unseen_costs(self, hypotheses: Sequence[Hypothesis]) -> list[float]:
         """Robust sums of squares of what is left of the run that no fit saw; [] without one."""
         if self.holdout is None:
             return []
-        problem, left = self.replay_holdout(hypotheses)
-        return [float(compute_misfit(problem.whiten_residuals(each[None]))[0]) for each in left]
+        problem, residuals = self.replay_holdout(hypotheses)
+        return [float(compute_misfit(problem.whiten_residuals(each[None]))[0]) for each in residuals]
 
     def judge_on_all(self, hypotheses: Sequence[Hypothesis], steps: int) -> list[Hypothesis]:
         """The hypotheses with their errors on all of the recordings that the runs were cut from.
@@ -423,13 +423,13 @@ class Search:
         fits = [h.fit for h in hypotheses]
         runs = [judge_on_all(self.problem, fits, run, steps) for run in self.whole]
         out = []
-        for h, own, *others in zip(hypotheses, *runs, strict=True):
-            errors = own.errors
+        for h, judgement, *others in zip(hypotheses, *runs, strict=True):
+            errors = judgement.errors
             ratio = {s: min(x, errors[s] / floor[s]) for s, x in h.ratio.items()}
-            if not all(j.holds(floor) for j in (own, *others)):
-                left = [j.typical_ratio(floor) for j in (own, *others)]
-                ratio = {s: max(x, *(each[s] for each in left)) for s, x in h.ratio.items()}
-            out.append(replace(h, errors=errors, ratio=ratio, judgement=own))
+            if not all(j.holds(floor) for j in (judgement, *others)):
+                ratios = [j.typical_ratio(floor) for j in (judgement, *others)]
+                ratio = {s: max(x, *(each[s] for each in ratios)) for s, x in h.ratio.items()}
+            out.append(replace(h, errors=errors, ratio=ratio, judgement=judgement))
         return out
 
     def learn_noise(self, best: Hypothesis) -> None:
@@ -445,10 +445,10 @@ class Search:
         self.fine = None if self.fine is None else replace(self.fine, noise=self.noise)
         self.repeats = [replace(p, noise=self.noise) for p in self.repeats]
 
-    def _add_rounding(self, trace: Trace, found: Iterable[Noise]) -> tuple[Noise, ...]:
+    def _add_rounding(self, trace: Trace, noise: Iterable[Noise]) -> tuple[Noise, ...]:
         """The noise of each output with that of rounding, which repeats do not show, as they round alike."""
         return tuple(n._replace(innovation=float(np.hypot(n.innovation, self.coarse.get(s, 0.0))))
-                     for s, n in zip(trace.outputs, found, strict=True))
+                     for s, n in zip(trace.outputs, noise, strict=True))
 
     def match_noise(self, best: Hypothesis) -> None:
         """Take the noise for so large that 99 of 100 blocks of the best hypothesis count by their squares.
@@ -476,8 +476,8 @@ class Search:
         """What `learn_noise` finds, and no less than a small part of what the sensors are said to have."""
         trace = self.problem.trace
         least = [QUIETEST_NOISE * self.sensors[name].level for name in trace.outputs]
-        return tuple(noises.white_noise(low) if found.level < low else found
-                     for found, low in zip(learn_noise(best, trace, self.noise), least, strict=True))
+        return tuple(noises.white_noise(low) if noise.level < low else noise
+                     for noise, low in zip(learn_noise(best, trace, self.noise), least, strict=True))
 
     def refit_hypothesis(self, h: Hypothesis, rounds: int = 4) -> Hypothesis:
         """A hypothesis refitted with the noise, the steps and the runs as they are now."""
@@ -489,15 +489,15 @@ class Search:
 
     def finish_hypothesis(self, h: Hypothesis, rounds: int = 5) -> Hypothesis:
         """A hypothesis taken to the end, with a covariance that its intervals can rest on."""
-        begin = turn_amplitudes_positive(h.fit.free, h.fit.x, self.model.kind.list_effects())
-        near = fit_unknowns(self.problem, h.fit.free, begin, 2)
-        found = finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage)
-        return self._judge_all_runs(h, found)
+        start = turn_amplitudes_positive(h.fit.free, h.fit.x, self.model.kind.list_effects())
+        near = fit_unknowns(self.problem, h.fit.free, start, 2)
+        fit = finish_fit(self.fine or self.problem, near, rounds, self.problem, self.stage)
+        return self._judge_all_runs(h, fit)
 
-    def _judge_all_runs(self, h: Hypothesis, found: Fit) -> Hypothesis:
+    def _judge_all_runs(self, h: Hypothesis, fit: Fit) -> Hypothesis:
         """What a fit to all runs leaves, of which no repeat is replayed again."""
         ends = np.cumsum([len(run) for run in (self.problem.trace, *self.problem.also)])
-        return self.judge_fit(h.effects, found, np.split(found.residuals, ends[:-1], axis=1)[1:])
+        return self.judge_fit(h.effects, fit, np.split(fit.residuals, ends[:-1], axis=1)[1:])
 
     def reaches_floor(self, h: Hypothesis) -> bool:
         """Whether a hypothesis leaves only noise, if need be with finer steps: a little more may be the solver's error.
@@ -563,16 +563,16 @@ class Search:
         floor, rows = self.estimate_floor(base), np.zeros(len(self.problem.trace), bool)
         for entry in map(self.model.find_effect, self.effects):
             start = max(entry.starts, key=lambda values: abs(values[entry.fitted[0]]))
-            changed = self.problem.model.replace(dict(start))
-            rows |= find_undecided_rows(replace(self.problem, model=changed, bare=None, _lanes={}), base.fit, floor)
+            model = self.problem.model.replace(dict(start))
+            rows |= find_undecided_rows(replace(self.problem, model=model, bare=None, _lanes={}), base.fit, floor)
         return self._leave_out(rows)
 
-    def _leave_out(self, undecided: Flags) -> bool:
-        if leave_out_rows(self.problem.trace, undecided) is self.problem.trace:
+    def _leave_out(self, is_undecided: Flags) -> bool:
+        if leave_out_rows(self.problem.trace, is_undecided) is self.problem.trace:
             return False
 
         def cut(problem: Problem) -> Problem:
-            runs = [leave_out_rows(run, undecided[:len(run)]) for run in (problem.trace, *problem.also)]
+            runs = [leave_out_rows(run, is_undecided[:len(run)]) for run in (problem.trace, *problem.also)]
             return replace(problem, trace=runs[0], also=tuple(runs[1:]), _lanes={})
 
         self.problem, self.fine = cut(self.problem), None if self.fine is None else cut(self.fine)
@@ -599,15 +599,15 @@ class Search:
         Last fits differ by hundreds through single stops that they make or miss. From the same tolerances the two
         differ by what their effects do.
         """
-        free, there = rival.fit.free, best.fit.values
-        own = {name for effect in rival.effects for name in self.model.find_effect(effect).fitted}
-        x = np.array([(there[f.name] - f.centre) / f.scale if f.name in there and f.name not in own else v
+        free, values = rival.fit.free, best.fit.values
+        names = {name for effect in rival.effects for name in self.model.find_effect(effect).fitted}
+        x = np.array([(values[f.name] - f.centre) / f.scale if f.name in values and f.name not in names else v
                       for f, v in zip(free, rival.fit.x, strict=True)])
-        begun = fit_unknowns(self.problem, free, np.clip(x, *scaled_bounds(free)), rounds)
-        again = self.finish_hypothesis(self.judge_fit(rival.effects, begun))
+        fit = fit_unknowns(self.problem, free, np.clip(x, *scaled_bounds(free)), rounds)
+        again = self.finish_hypothesis(self.judge_fit(rival.effects, fit))
         return min(rival, again, key=lambda each: each.cost)
 
-    def begin_look_alikes(self, best: Hypothesis, known: Container[frozenset[str]]) -> list[Hypothesis]:
+    def begin_look_alikes(self, best: Hypothesis, effect_sets: Container[frozenset[str]]) -> list[Hypothesis]:
         """The best hypothesis with a look-alike in place of one effect, from its tolerances, if noise is left then.
 
         The search fits what promises most from the tolerances of the base. There a look-alike may miss a stop, and
@@ -616,27 +616,27 @@ class Search:
 
         Args:
             best: with one or several effects.
-            known: sets of effects that need not be tried.
+            effect_sets: sets of effects that need not be tried.
         """
-        found: list[Hypothesis] = []
-        for gone in best.effects:
-            rest = tuple(effect for effect in best.effects if effect != gone)
-            without = linearise(self.problem, *self._place_without(best.fit, gone))
-            told = self.compare_signatures(without)
-            own = [effect == gone for effect in told.names]
-            alike = {effect for effect, cosines in zip(told.names, np.abs(told.gram), strict=True)
-                     if max(cosines[own], default=0.0) > LOOKS_ALIKE and frozenset((*rest, effect)) not in known}
-            alike &= set(self.list_further_effects(rest)) - {gone}
+        look_alikes: list[Hypothesis] = []
+        for effect in best.effects:
+            rest = tuple(name for name in best.effects if name != effect)
+            without = linearise(self.problem, *self._place_without(best.fit, effect))
+            sensitivity = self.compare_signatures(without)
+            is_own = [name == effect for name in sensitivity.names]
+            alike = {name for name, cosines in zip(sensitivity.names, np.abs(sensitivity.gram), strict=True)
+                     if max(cosines[is_own], default=0.0) > LOOKS_ALIKE and frozenset((*rest, name)) not in effect_sets}
+            alike &= set(self.list_further_effects(rest)) - {effect}
             if alike:
-                found += self.begin_effects(without, sorted(alike), rest)
-        return found
+                look_alikes += self.begin_effects(without, sorted(alike), rest)
+        return look_alikes
 
     def compare_signatures(self, fit: Fit) -> Sensitivity:
         """What the effects would change at a fit; repeats of the same command would show the same once more."""
         coarse = self.make_problem(self.problem.trace, Problem.steps)  # enough for cosines
-        of_run = replace(fit, jacobian=fit.jacobian[:, :, :len(self.problem.trace)])
-        found = compute_sensitivity(coarse, of_run, self.effects)
-        return found._replace(gains=(1 + len(self.problem.also)) * found.gains)
+        run_fit = replace(fit, jacobian=fit.jacobian[:, :, :len(self.problem.trace)])
+        sensitivity = compute_sensitivity(coarse, run_fit, self.effects)
+        return sensitivity._replace(gains=(1 + len(self.problem.also)) * sensitivity.gains)
 
     def begin_effects(self, base: Fit, effects: Sequence[str], present: tuple[str, ...] = ()) -> list[Hypothesis]:
         """Those of the effects, each on top of a fit, that gain over it and leave only noise, taken to the end.
@@ -650,10 +650,10 @@ class Search:
             return self.judge_fit((*present, p.effect), fit_unknowns(self.problem, p.free, p.x, 4))
 
         prospects = scan_effects(self.problem, [base], effects, self.workers)
-        found = self.map_parallel(begin, [p for p in prospects if p.cost < base.cost - GAIN_WORTH_A_FIT])
-        worth = [h for h in found if h.is_near_floor and h.cost < base.cost - GAIN_SEEN]
-        finished = self.map_parallel(self.finish_hypothesis, worth)
-        return self.map_parallel(self.begin_again, [h for h in finished if h.is_at_floor])
+        hypotheses = self.map_parallel(begin, [p for p in prospects if p.cost < base.cost - GAIN_WORTH_A_FIT])
+        candidates = [h for h in hypotheses if h.is_near_floor and h.cost < base.cost - GAIN_SEEN]
+        last_fits = self.map_parallel(self.finish_hypothesis, candidates)
+        return self.map_parallel(self.begin_again, [h for h in last_fits if h.is_at_floor])
 
     def measure_solver_error(self, h: Hypothesis, floor: Mapping[str, float]) -> float:
         """What half the step changes in a replay, over the floor, in the worst signal."""
@@ -673,22 +673,22 @@ class Search:
 
 def list_compatible_effects(model: Model, effects: Iterable[str], present: Sequence[str]) -> list[str]:
     """The effects that may stand beside those that are `present`."""
-    excluded = {name for e in present for name in model.find_effect(e).excludes}
-    return [e for e in effects if e not in present and e not in excluded
+    excluded_names = {name for e in present for name in model.find_effect(e).excludes}
+    return [e for e in effects if e not in present and e not in excluded_names
             and not set(model.find_effect(e).excludes) & set(present)]
 
 
 def learn_noise(h: Hypothesis, trace: Trace, before: Sequence[Noise]) -> list[Noise]:
     """Noise of each signal: of the difference between repeats, else of the residual where only noise is left."""
-    found = []
+    noise = []
     for i, old in enumerate(before):
         if h.others:
             n = min(len(trace), *(o.shape[1] for o in h.others))
             difference = np.concatenate([(h.fit.residuals[i, :n] - o[i, :n]) for o in h.others]) / np.sqrt(2.0)
-            found.append(noises.fit_noise(difference))
+            noise.append(noises.fit_noise(difference))
         else:
-            found.append(noises.fit_noise(h.fit.residuals[i]) if h.is_at_floor else old)
-    return found
+            noise.append(noises.fit_noise(h.fit.residuals[i]) if h.is_at_floor else old)
+    return noise
 
 
 def measure_repeating(residual: Floats, others: Sequence[Floats], coarse: Sequence[float]) -> list[float]:
@@ -698,12 +698,12 @@ def measure_repeating(residual: Floats, others: Sequence[Floats], coarse: Sequen
     Rounding, `coarse` (s,) RMS, repeats where the ram rests: it is taken for noise.
     """
     ratios = []
-    for own, rounding, i in zip(residual, coarse, range(len(residual)), strict=True):
-        n = min(len(own), *(o.shape[1] for o in others))
-        shared = float(np.mean([np.nanmean(own[:n] * o[i, :n]) for o in others]))
-        different = np.concatenate([own[:n] - o[i, :n] for o in others]) / np.sqrt(2.0)
-        noise = noises.measure_level(different) ** 2 + rounding**2 + 1e-300
-        ratios.append(float(np.sqrt(max(1.0 + (shared - rounding**2) / noise, 0.0))))
+    for row, rounding, i in zip(residual, coarse, range(len(residual)), strict=True):
+        n = min(len(row), *(o.shape[1] for o in others))
+        product = float(np.mean([np.nanmean(row[:n] * o[i, :n]) for o in others]))
+        difference = np.concatenate([row[:n] - o[i, :n] for o in others]) / np.sqrt(2.0)
+        noise = noises.measure_level(difference) ** 2 + rounding**2 + 1e-300
+        ratios.append(float(np.sqrt(max(1.0 + (product - rounding**2) / noise, 0.0))))
     return ratios
 
 
@@ -714,8 +714,8 @@ def _leave_out_worst(residuals: Floats, share: float = 0.15) -> Floats:
     """
     sums = sum_blocks(np.nan_to_num(residuals))
     most = np.array([np.quantile(each[each > 0.0], 1.0 - share) if each.any() else 0.0 for each in sums])
-    kept = sums <= most[:, None]
-    return np.where(np.repeat(kept, BLOCK, axis=1)[:, :residuals.shape[1]], residuals, np.nan)
+    is_typical = sums <= most[:, None]
+    return np.where(np.repeat(is_typical, BLOCK, axis=1)[:, :residuals.shape[1]], residuals, np.nan)
 
 
 def _measure_rms(residuals: Floats, signals: Sequence[str]) -> dict[str, float]:
@@ -779,10 +779,10 @@ def scan_effects(problem: Problem, fits: Sequence[Fit], effects: Iterable[str], 
 
     def try_starts(starts: Sequence[tuple[Fit, tuple[str, Start, bool]]]) -> list[Trial]:
         def simulate_own(fit: Fit) -> list[Trial]:
-            return simulate_starts(problem, fit, [own for each, own in starts if each is fit], workers)
+            return simulate_starts(problem, fit, [start for each, start in starts if each is fit], workers)
 
-        tried = map_together(simulate_own, fits, workers)
-        return _keep_best([*best, *(trial for several in tried for trial in several)])
+        trials = map_together(simulate_own, fits, workers)
+        return _keep_best([*best, *(trial for several in trials for trial in several)])
 
     best = try_starts([
         (fit, (name, start, along)) for fit in fits for name in effects
@@ -809,12 +809,12 @@ def _start_at_fit(problem: Problem, fit: Fit, effect: str) -> list[Start]:
 
 
 def _make_prospect(problem: Problem, t: Trial) -> Prospect:
-    mine = {u.name: u for u in list_effect_unknowns(problem.model.find_effect(t.effect), problem.model)}
-    kept = tuple(mine.get(f.name, f) for f in t.fit.free)  # a suspect of the reference model loses its tolerance
-    own = tuple(u for name, u in mine.items() if name not in {f.name for f in t.fit.free})
-    found = {f.name: f.centre + f.scale * float(v) for f, v in zip(t.fit.free, t.x, strict=True)}
-    values = {**found, **t.start}
-    free = (*kept, *own)
+    unknowns = {u.name: u for u in list_effect_unknowns(problem.model.find_effect(t.effect), problem.model)}
+    base_free = tuple(unknowns.get(f.name, f) for f in t.fit.free)  # a base effect loses its tolerance
+    new_free = tuple(u for name, u in unknowns.items() if name not in {f.name for f in t.fit.free})
+    fit_values = {f.name: f.centre + f.scale * float(v) for f, v in zip(t.fit.free, t.x, strict=True)}
+    values = {**fit_values, **t.start}
+    free = (*base_free, *new_free)
     return Prospect(t.effect, t.cost, free, np.array([(values[f.name] - f.centre) / f.scale for f in free]))
 
 
@@ -835,10 +835,10 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     signals together, are tried, at four phases as the answer may lag, and larger as what is fast is weakened.
     """
     entry = problem.model.find_effect(effect)
-    named = name_sine(entry)
-    if named is None:
+    sine = name_sine(entry)
+    if sine is None:
         return []
-    size, tone, phase = named
+    size, tone, phase = sine
     still = {**entry.starts[0], tone: max(1e-6, entry.parameters[tone].low), phase: 0.5 * np.pi}
     names = list(still)
     at = np.array([list(still.values()), [entry.off.get(n, still[n]) for n in names]])
@@ -853,16 +853,16 @@ def find_tones(problem: Problem, fit: Fit, effect: str) -> list[dict[str, float]
     surroundings = 3.0  # Hz on either side of a line, above which it has to stand out
     height = (_measure_prominence(np.abs(spectra), round(surroundings / hertz[1])) ** 2).sum(axis=0) * (hertz > 0.5)
     line = spectra.sum(axis=0) * 2.0 / max(float((answer**2).sum()), 1e-300)  # in sizes of the start
-    found = []
+    starts = []
     before = 2.0 * np.pi * period * (longest.first + longest.later)  # s times 2 pi, from the clock's 0 to the piece
     distance = 1.0  # Hz, between lines
     for _ in range(LINES):
         k = int(np.argmax(height))
-        found += [{size: still[size] * larger * float(np.abs(line[k])), tone: float(hertz[k]),
-                   phase: float(np.angle(line[k])) + turn * np.pi - before * float(hertz[k])}
-                  for turn in (0.5, 1.0, 1.5, 2.0) for larger in (1.0, 4.0, 16.0)]
+        starts += [{size: still[size] * larger * float(np.abs(line[k])), tone: float(hertz[k]),
+                    phase: float(np.angle(line[k])) + turn * np.pi - before * float(hertz[k])}
+                   for turn in (0.5, 1.0, 1.5, 2.0) for larger in (1.0, 4.0, 16.0)]
         height[np.abs(hertz - hertz[k]) < distance] = 0.0
-    return found
+    return starts
 
 
 def _list_lines_beside(problem: Problem, t: Trial) -> list[dict[str, float]]:
@@ -872,10 +872,10 @@ def _list_lines_beside(problem: Problem, t: Trial) -> list[dict[str, float]]:
     less than half a turn away: it does not leave the line that it begins in.
     """
     entry = problem.model.find_effect(t.effect)
-    named = name_sine(entry)
-    if named is None:
+    sine = name_sine(entry)
+    if sine is None:
         return []
-    _, tone, phase = named
+    _, tone, phase = sine
     longest = _find_longest_piece(problem)
     period = problem.model.values["controller.period"]
     turn = 1.0 / (period * (longest.stop - longest.first))  # Hz
@@ -904,10 +904,10 @@ def _measure_prominence(spectra: Floats, width: int) -> Floats:
 E = TypeVar("E", Trial, Prospect)
 
 
-def _keep_best(tried: Iterable[E]) -> list[E]:
+def _keep_best(trials: Iterable[E]) -> list[E]:
     """The best of each effect, best first."""
     best: dict[str, E] = {}
-    for each in sorted(tried, key=lambda t: t.cost):
+    for each in sorted(trials, key=lambda t: t.cost):
         best.setdefault(each.effect, each)
     return list(best.values())
 
@@ -919,16 +919,17 @@ def simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Star
         return []
     names = list(dict.fromkeys([f.name for f in fit.free] + [n for _, start, _ in starts for n in start]))
     ways = list_powers(problem)
-    begun = [_move_along(fit, effect, start, ways) if along else fit.x for effect, start, along in starts]
-    at = [problem.list_values(fit.free, x) | dict(start) for x, (_, start, _) in zip(begun, starts, strict=True)]
+    x_start = [_move_along(fit, effect, start, ways) if along else fit.x for effect, start, along in starts]
+    at = [problem.list_values(fit.free, x) | dict(start) for x, (_, start, _) in zip(x_start, starts, strict=True)]
     rows = np.array([[values.get(n, problem.model.values[n]) for n in names] for values in at])
 
     def run_trials(part: NDArray[np.int64]) -> list[Trial]:
         white = problem.whiten_predictions(problem.predict_outputs(names, rows[part]))
-        own = [starts[i] for i in part]
-        costs, x = absorb_shifts(fit, white, [start for _, start, _ in own], np.array([begun[i] for i in part]))
+        part_starts = [starts[i] for i in part]
+        costs, x = absorb_shifts(fit, white, [start for _, start, _ in part_starts],
+                                 np.array([x_start[i] for i in part]))
         return [Trial(effect, start, float(cost), at, along, fit)
-                for (effect, start, along), cost, at in zip(own, costs, x, strict=True)]
+                for (effect, start, along), cost, at in zip(part_starts, costs, x, strict=True)]
 
     parts = np.array_split(np.arange(len(rows)), min(len(rows), max(workers, -(-len(rows) // TOGETHER))))
     return [trial for several in map_together(run_trials, parts, workers) for trial in several]
@@ -936,15 +937,16 @@ def simulate_starts(problem: Problem, fit: Fit, starts: Sequence[tuple[str, Star
 
 def _move_along(fit: Fit, effect: str, start: Start, ways: Sequence[Mapping[str, float]]) -> Floats:
     """The fit's unknowns, (p,), after what goes with an effect has moved, within their bounds."""
-    left = max(1.0 - next(iter(start.values())), 0.01)  # a filter that lets nothing through has no power
+    remainder = max(1.0 - next(iter(start.values())), 0.01)  # a filter that lets nothing through has no power
     low, high = scaled_bounds(fit.free)
     x = fit.x
     for way in GOES_WITH[effect]:
-        x = scale_together(fit.free, x, ways[way], float(np.log(left)))
+        x = scale_together(fit.free, x, ways[way], float(np.log(remainder)))
     return np.clip(x, low, high)
 
 
-def absorb_shifts(fit: Fit, white: Floats, held: Sequence[Iterable[str]], begun: Floats) -> tuple[Floats, Floats]:
+def absorb_shifts(fit: Fit, white: Floats, fixed_names: Sequence[Iterable[str]], x_start: Floats
+                  ) -> tuple[Floats, Floats]:
     """A fit's unknowns take up what they can of whitened residuals: the costs that are left, and where they are then.
 
     They shift linearly, twice, as what can be fitted is known only after the first time; not at all where to stay is
@@ -953,25 +955,25 @@ def absorb_shifts(fit: Fit, white: Floats, held: Sequence[Iterable[str]], begun:
     Args:
         fit: with the Jacobian.
         white: (m, s, n), each simulated at its own unknowns.
-        held: of each residual the unknowns that stay where they are.
-        begun: (m, p), the unknowns.
+        fixed_names: of each residual the unknowns that stay where they are.
+        x_start: (m, p), the unknowns.
     """
-    moves = np.array([[f.name not in names for f in fit.free] for names in held])
+    can_move = np.array([[f.name not in names for f in fit.free] for names in fixed_names])
     if not fit.free:  # a plant without tolerances
-        return compute_misfit(white), begun
-    x = _shift_unknowns(fit, white[:, :, ::SCAN_STRIDE], begun, moves)
+        return compute_misfit(white), x_start
+    x = _shift_unknowns(fit, white[:, :, ::SCAN_STRIDE], x_start, can_move)
     whole, priors = fit.jacobian.reshape(len(fit.x), -1), weigh_priors(fit.free)
-    costs = (x * moves) ** 2 @ priors
+    costs = (x * can_move) ** 2 @ priors
     for few in cut_runs(white.shape):
-        left = white[few] + ((x[few] - begun[few]) @ whole).reshape(white[few].shape)
-        costs[few] += compute_misfit(left)
-    stayed = compute_misfit(white) + (begun * moves) ** 2 @ priors
-    stays = stayed < costs
-    return np.where(stays, stayed, costs), np.where(stays[:, None], begun, x)
+        residuals = white[few] + ((x[few] - x_start[few]) @ whole).reshape(white[few].shape)
+        costs[few] += compute_misfit(residuals)
+    start_costs = compute_misfit(white) + (x_start * can_move) ** 2 @ priors
+    is_start_better = start_costs < costs
+    return np.where(is_start_better, start_costs, costs), np.where(is_start_better[:, None], x_start, x)
 
 
-def _shift_unknowns(fit: Fit, thin: Floats, begun: Floats, moves: Flags) -> Floats:
-    """Where unknowns have moved from `begun`, (m, p), of which `moves` says which may.
+def _shift_unknowns(fit: Fit, thin: Floats, x_start: Floats, can_move: Flags) -> Floats:
+    """Where unknowns have moved from `x_start`, (m, p), of which `can_move` says which may.
 
     `thin`, (m, s, k), are the residuals at every `SCAN_STRIDE`-th sample. A weight belongs to a block, so a Hessian is
     a weighted sum of those of the blocks, which all residuals have in common.
@@ -984,15 +986,16 @@ def _shift_unknowns(fit: Fit, thin: Floats, begun: Floats, moves: Flags) -> Floa
     flat = slopes.reshape(unknowns, -1)
     of_block = cut_blocks(slopes, block).reshape(unknowns, -1, block).transpose(1, 0, 2)
     squares = (of_block @ of_block.transpose(0, 2, 1)).reshape(len(of_block), -1)
-    held = np.eye(unknowns) * np.where(moves, priors + 1e-9, 1e30)[:, None]  # what is held does not move
-    left, x = thin, begun
+    stiffness = np.eye(unknowns) * np.where(can_move, priors + 1e-9, 1e30)[:, None]  # what is fixed does not move
+    residuals, x = thin, x_start
     for _ in range(2):
-        weights = SCAN_STRIDE * weigh_blocks(left, block)
+        weights = SCAN_STRIDE * weigh_blocks(residuals, block)
         heavy = thin * np.repeat(weights, block, axis=-1)[..., :thin.shape[-1]]
-        hessian = (weights.reshape(len(thin), -1) @ squares).reshape(held.shape) + held
-        gradient = heavy.reshape(len(thin), -1) @ flat.T + priors * begun * moves
-        x = np.where(moves, np.clip(begun - np.linalg.solve(hessian, gradient[..., None])[..., 0], low, high), begun)
-        left = thin + ((x - begun) @ flat).reshape(thin.shape)
+        hessian = (weights.reshape(len(thin), -1) @ squares).reshape(stiffness.shape) + stiffness
+        gradient = heavy.reshape(len(thin), -1) @ flat.T + priors * x_start * can_move
+        x = np.where(can_move, np.clip(x_start - np.linalg.solve(hessian, gradient[..., None])[..., 0], low, high),
+                     x_start)
+        residuals = thin + ((x - x_start) @ flat).reshape(thin.shape)
     return x
 
 
@@ -1008,8 +1011,8 @@ class Sensitivity(NamedTuple):
 
     def list_unseen_effects(self, gain: float) -> list[str]:
         """The effects of which no direction would gain so much."""
-        seen = {name for name, own in zip(self.names, self.gains, strict=True) if own >= gain}
-        return [name for name in dict.fromkeys(self.names) if name not in seen]
+        visible_names = {name for name, each in zip(self.names, self.gains, strict=True) if each >= gain}
+        return [name for name in dict.fromkeys(self.names) if name not in visible_names]
 
 
 def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> Sensitivity:
@@ -1019,17 +1022,17 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
     if not starts:
         return Sensitivity((), np.empty((0, 0)), np.empty(0))
     names = list(dict.fromkeys([*fit.values, *(n for _, s in starts for n in s)]))
-    held = [fit.values.get(n, problem.model.values[n]) for n in names]
-    rows = np.array([held, *([s.get(n, v) for n, v in zip(names, held, strict=True)] for _, s in starts)])
+    base_values = [fit.values.get(n, problem.model.values[n]) for n in names]
+    rows = np.array([base_values, *([s.get(n, v) for n, v in zip(names, base_values, strict=True)] for _, s in starts)])
     parts = np.array_split(rows, -(-len(rows) // TOGETHER))
     white = np.concatenate([problem.whiten_predictions(problem.predict_outputs(names, part))[:, :, ::NULL_STRIDE]
                             for part in parts])
     thin = (white[1:] - white[0]).reshape(len(starts), -1) * np.sqrt(NULL_STRIDE)
-    own = fit.jacobian[:, :, ::NULL_STRIDE].reshape(len(fit.x), thin.shape[1]) * np.sqrt(NULL_STRIDE)
+    slopes = fit.jacobian[:, :, ::NULL_STRIDE].reshape(len(fit.x), thin.shape[1]) * np.sqrt(NULL_STRIDE)
     prior = np.diag([f.prior**-2 + 1e-9 for f in fit.free])
-    left = thin - (thin @ own.T) @ np.linalg.solve(own @ own.T + prior, own)
-    length = np.sqrt(np.maximum(np.einsum("ij,ij->i", left, left), 1e-300))
-    return Sensitivity(tuple(e for e, _ in starts), (left @ left.T) / np.outer(length, length), length**2)
+    directions = thin - (thin @ slopes.T) @ np.linalg.solve(slopes @ slopes.T + prior, slopes)
+    length = np.sqrt(np.maximum(np.einsum("ij,ij->i", directions, directions), 1e-300))
+    return Sensitivity(tuple(e for e, _ in starts), (directions @ directions.T) / np.outer(length, length), length**2)
 
 
 def compute_p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int = 0) -> float:
@@ -1043,6 +1046,6 @@ def compute_p_value(s: Sensitivity, gain: float, parameters: int = 1, seed: int 
     weight, vectors = np.linalg.eigh(s.gram)
     draws = rng.standard_normal((NULL_DRAWS, len(weight))) @ (vectors * np.sqrt(np.maximum(weight, 0.0))).T
     best = (np.maximum(draws, 0.0) ** 2).max(axis=1)
-    simulated = float(np.mean(best >= gain))
+    share = float(np.mean(best >= gain))
     bound = len(set(s.names)) * float(chdtrc(parameters, max(gain, 0.0)))
-    return simulated if simulated > 10.0 / NULL_DRAWS else min(max(bound, 1e-300), max(simulated, 1.0 / NULL_DRAWS))
+    return share if share > 10.0 / NULL_DRAWS else min(max(bound, 1e-300), max(share, 1.0 / NULL_DRAWS))

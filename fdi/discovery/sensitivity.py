@@ -75,7 +75,7 @@ class Claim(NamedTuple):
     largest: float  # usual size: distance from the off value, SI
     smallest: float | None  # size that was named NEEDED times of TRIALS
     named: Share | None
-    counts: Sequence[tuple[float, int, int]]  # (size, named, of) of each size that was tried, smallest first
+    counts: Sequence[tuple[float, int, int]]  # (size, hits, trials) of each size that was tried, smallest first
     taken_for: Mapping[str, int]  # what the others were taken for, with how often
 
 
@@ -95,15 +95,15 @@ def describe_unit(runs: Runs, answer: Answer, effects: Sequence[str] = (), effec
     require(not runs.est.sensors, "--sensitivity", ", ".join(runs.est.sensors), "sensors that neither filter nor delay")
     require(best.is_at_floor, "--sensitivity", answer.verdict, "runs that the model explains; here more than noise is "
             "left, so no simulated run stands for a measured one (rig add first)")
-    offered = [name for name in e.search.effects if name not in best.effects]
+    candidates = [name for name in e.search.effects if name not in best.effects]
     for name in effects:
-        require(name in offered, "--hide", name, f"one of {', '.join(offered)}")
-    fitted = limit_friction_values(best.fit.values)
-    found = {p for name in best.effects for p in runs.model.find_effect(name).fitted if p in fitted}
+        require(name in candidates, "--hide", name, f"one of {', '.join(candidates)}")
+    values = limit_friction_values(best.fit.values)
+    parameters = {p for name in best.effects for p in runs.model.find_effect(name).fitted if p in values}
     problem = e.search.problem
-    return Unit(runs.model.replace({name: fitted[name] for name in sorted(found)}, "fit"), fitted,
+    return Unit(runs.model.replace({name: values[name] for name in sorted(parameters)}, "fit"), values,
                 dict(zip(problem.trace.outputs, problem.noise, strict=True)), _read_play(runs.est), len(runs.repeats),
-                None if runs.holdout is None else _read_play(runs.holdout), tuple(effects or offered),
+                None if runs.holdout is None else _read_play(runs.holdout), tuple(effects or candidates),
                 tuple(effect_files), str(runs.model.kind.file or ""))
 
 
@@ -117,15 +117,15 @@ def find_first_rungs(answer: Answer, effects: Sequence[str]) -> dict[str, int]:
     It is one above the smallest that gains `GAIN_DETECTED`: a search wants more than a gain in a known place.
     """
     search = answer.explanation.search
-    tried = [(way, rung) for name in effects for way in list_directions(name, search.model)[:1]
+    pairs = [(way, rung) for name in effects for way in list_directions(name, search.model)[:1]
              for rung in range(RUNGS)]
     gains = VirtualTest(search.problem, answer.best.fit).measure_gains(
-        [way for way, _ in tried], [way.most * 0.5**rung for way, rung in tried]) if tried else []
-    shown: dict[str, int] = dict.fromkeys(effects, 0)
-    for (way, rung), gain in zip(tried, gains, strict=True):
+        [way for way, _ in pairs], [way.most * 0.5**rung for way, rung in pairs]) if pairs else []
+    rungs: dict[str, int] = dict.fromkeys(effects, 0)
+    for (way, rung), gain in zip(pairs, gains, strict=True):
         if gain > GAIN_DETECTED:
-            shown[way.effect] = max(shown[way.effect], rung - 1)
-    return shown
+            rungs[way.effect] = max(rungs[way.effect], rung - 1)
+    return rungs
 
 
 def choose_way(model: Model, effect: str, trial: int) -> Direction:
@@ -142,13 +142,13 @@ def measure_size(model: Model, effect: str, rung: int) -> float:
 def hide_effect(unit: Unit, injection: Injection) -> Runs:
     """The simulated runs of the unit with the effect in it, as `read_runs` would read them."""
     way = choose_way(unit.model, injection.effect, injection.trial)
-    own = unit.model.replace(unit.values, "fit").with_effects([injection.effect])
-    changed = move_effect(own, own.values, way, way.most * 0.5**injection.rung)
-    hidden = own.replace(limit_friction_values({**own.values, **changed}), "hidden effect")
+    unit_model = unit.model.replace(unit.values, "fit").with_effects([injection.effect])
+    parameters = move_effect(unit_model, unit_model.values, way, way.most * 0.5**injection.rung)
+    true_model = unit_model.replace(limit_friction_values({**unit_model.values, **parameters}), "hidden effect")
     seeds = np.random.SeedSequence([injection.number]).spawn(2 + unit.repeats)
     est, unseen, *repeats = (np.random.default_rng(seed) for seed in seeds)
-    runs = [_simulate_run(unit, hidden, unit.play, rng) for rng in (est, *repeats)]
-    holdout = None if unit.holdout is None else _simulate_run(unit, hidden, unit.holdout, unseen)
+    runs = [_simulate_run(unit, true_model, unit.play, rng) for rng in (est, *repeats)]
+    holdout = None if unit.holdout is None else _simulate_run(unit, true_model, unit.holdout, unseen)
     return read_runs(unit.model, runs[0], runs[1:], holdout, list(unit.noise))
 
 
@@ -162,12 +162,12 @@ def _simulate_run(unit: Unit, model: Model, play: Play, rng: np.random.Generator
     columns = {signals.command.name: play.command}
     columns |= {} if signals.load is None else {signals.load.name: play.load}
     if model.kind.controller:
-        drawn = rng.standard_normal((n, len(signals.outputs) + 1))
-        fed = [(i, s) for i, s in enumerate(signals.outputs) if s.noise and s.name in noise]
-        for i, signal in fed:
-            drawn[:, i] = noise.pop(signal.name) / unit.noise[signal.name].level
-        heard = model.replace({s.noise: unit.noise[s.name].level for _, s in fed}, "noise")
-        columns |= simulate(heard, play.command, play.load, steps=UNIT_STEPS * model.steps, drawn=drawn)._asdict()
+        draws = rng.standard_normal((n, len(signals.outputs) + 1))
+        readings = [(i, s) for i, s in enumerate(signals.outputs) if s.noise and s.name in noise]
+        for i, signal in readings:
+            draws[:, i] = noise.pop(signal.name) / unit.noise[signal.name].level
+        noisy_model = model.replace({s.noise: unit.noise[s.name].level for _, s in readings}, "noise")
+        columns |= simulate(noisy_model, play.command, play.load, steps=UNIT_STEPS * model.steps, drawn=draws)._asdict()
     else:
         out = Lanes(model, (), UNIT_STEPS * model.steps, 1).replay(np.empty((1, 0)), play.drive, play.load)[0]
         columns |= {signals.drive.name: play.drive} | {s.name: out[:, i] for i, s in enumerate(signals.outputs)}
@@ -183,8 +183,8 @@ def draw_noise(noise: Noise, n: int, rng: np.random.Generator) -> Floats:
     from scipy.signal import lfilter  # here: it takes long to import
 
     settling = 1000  # samples until the process has forgotten its start
-    drawn: Floats = lfilter([noise.innovation], noise.filter, rng.standard_normal(settling + n))[settling:]
-    return drawn
+    samples: Floats = lfilter([noise.innovation], noise.filter, rng.standard_normal(settling + n))[settling:]
+    return samples
 
 
 def judge_injection(injection: Injection, unit: Unit) -> dict[str, Any]:
@@ -192,11 +192,11 @@ def judge_injection(injection: Injection, unit: Unit) -> dict[str, Any]:
     _load_files(unit.plant_file, unit.model.plant, unit.effect_files)
     runs = hide_effect(unit, injection)
     prepare_effects(runs)
-    found = explain_recording(runs)
-    named = list(found.effects)
+    explanation = explain_recording(runs)
+    effects = list(explanation.effects)
     return {**injection._asdict(), "size": measure_size(unit.model, injection.effect, injection.rung),
-            "verdict": found.verdict, "effects": named,
-            "is_named": found.verdict == "EXPLAINED" and named == [injection.effect]}
+            "verdict": explanation.verdict, "effects": effects,
+            "is_named": explanation.verdict == "EXPLAINED" and effects == [injection.effect]}
 
 
 @cache
@@ -211,25 +211,25 @@ def _load_files(plant_file: str, plant: str, effect_files: tuple[str, ...]) -> N
 def choose_injections(unit: Unit, first: Mapping[str, int], rows: Iterable[Mapping[str, Any]]) -> list[Injection]:
     """What to hide next: the trials of the rung under way, of each effect that is not decided; none at the end."""
     rows = list(rows)
-    counts, chosen, done = count_rungs(rows), list[Injection](), {row["number"] for row in rows}
-    offered = [entry.name for entry in unit.model.kind.list_effects()]
+    counts, injections, done_numbers = count_rungs(rows), list[Injection](), {row["number"] for row in rows}
+    names = [entry.name for entry in unit.model.kind.list_effects()]
     for effect in unit.effects:
         rung = _find_open_rung(counts.get(effect, {}), first[effect])
         if rung is not None:
-            place = (offered.index(effect) * RUNGS + rung) * TRIALS
+            place = (names.index(effect) * RUNGS + rung) * TRIALS
             # an interrupted round may have left out any of its trials
-            left = [trial for trial in range(TRIALS) if place + trial not in done][:TRIALS_AT_ONCE]
-            chosen += [Injection(place + trial, effect, rung, trial) for trial in left]
-    return chosen
+            trials = [trial for trial in range(TRIALS) if place + trial not in done_numbers][:TRIALS_AT_ONCE]
+            injections += [Injection(place + trial, effect, rung, trial) for trial in trials]
+    return injections
 
 
 def count_rungs(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[int, tuple[int, int]]]:
-    """(named, of) of each rung of each effect."""
+    """(hits, trials) of each rung of each effect: how often it was named, and how often hidden."""
     counts: dict[str, dict[int, tuple[int, int]]] = {}
     for row in rows:
-        own = counts.setdefault(row["effect"], {})
-        named, of = own.get(row["rung"], (0, 0))
-        own[row["rung"]] = named + row["is_named"], of + 1
+        rungs = counts.setdefault(row["effect"], {})
+        hits, trials = rungs.get(row["rung"], (0, 0))
+        rungs[row["rung"]] = hits + row["is_named"], trials + 1
     return counts
 
 
@@ -249,29 +249,29 @@ def _find_open_rung(counts: Mapping[int, tuple[int, int]], first: int) -> int | 
 
 def _judge_rung(counts: Mapping[int, tuple[int, int]], rung: int) -> bool | None:
     """Whether a rung is named often enough; None while both is possible."""
-    named, of = counts.get(rung, (0, 0))
-    if of - named > TRIALS - NEEDED:
+    hits, trials = counts.get(rung, (0, 0))
+    if trials - hits > TRIALS - NEEDED:
         return False
-    return True if of == TRIALS else None
+    return True if trials == TRIALS else None
 
 
 def summarise_injections(unit: Unit, rows: Sequence[Mapping[str, Any]]) -> list[Claim]:
     """The claim of each effect: the smallest size that was named often enough."""
     counts, claims = count_rungs(rows), []
     for effect in unit.effects:
-        entry, own = unit.model.find_effect(effect), counts.get(effect, {})
-        smallest = max((rung for rung in own if _judge_rung(own, rung)), default=None)
+        entry, rungs = unit.model.find_effect(effect), counts.get(effect, {})
+        smallest = max((rung for rung in rungs if _judge_rung(rungs, rung)), default=None)
         wrong = Counter(_describe_miss(row) for row in rows if row["effect"] == effect and not row["is_named"])
-        sizes = [(measure_size(unit.model, effect, rung), *own[rung]) for rung in sorted(own, reverse=True)]
+        sizes = [(measure_size(unit.model, effect, rung), *rungs[rung]) for rung in sorted(rungs, reverse=True)]
         claims.append(Claim(effect, entry.fitted[0], entry.parameters[entry.fitted[0]].unit,
                             measure_size(unit.model, effect, 0),
                             None if smallest is None else measure_size(unit.model, effect, smallest),
-                            None if smallest is None else measure_share(*own[smallest]), sizes,
+                            None if smallest is None else measure_share(*rungs[smallest]), sizes,
                             dict(wrong.most_common())))
     return claims
 
 
 def _describe_miss(row: Mapping[str, Any]) -> str:
     """What a run was taken for: a verdict, with the effects that it names."""
-    named = " and ".join(row["effects"])
-    return f"{named} ({row['verdict']})" if named else str(row["verdict"])
+    names = " and ".join(row["effects"])
+    return f"{names} ({row['verdict']})" if names else str(row["verdict"])

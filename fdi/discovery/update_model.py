@@ -85,9 +85,9 @@ class Refit:
         before, after = self.steps[-2:]
         if self.original.find_effect(str(after.effect)).port in UNREPLAYED:
             return True  # it was found without noise, or it would not be here
-        worse = any(x > 1.02 * before.holdout[s] for s, x in after.holdout.items() if x > 1.15 * self.floor[s])
-        lower = any(x < before.hypothesis.errors[s] for s, x in after.hypothesis.errors.items())
-        return measure_gain(before.hypothesis, after.hypothesis) > GAIN_SEEN and lower and not worse
+        is_worse = any(x > 1.02 * before.holdout[s] for s, x in after.holdout.items() if x > 1.15 * self.floor[s])
+        is_lower = any(x < before.hypothesis.errors[s] for s, x in after.hypothesis.errors.items())
+        return measure_gain(before.hypothesis, after.hypothesis) > GAIN_SEEN and is_lower and not is_worse
 
 
 def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: Sequence[Trace] = (),
@@ -110,29 +110,29 @@ def refit_effects(original: Model, effects: Sequence[str], est: Trace, repeats: 
     """
     check_addable(original, effects)
     marks = _read_marks(original, effects, [est, *repeats])
-    replayed = [e for e in effects if original.find_effect(e).port not in UNREPLAYED]
-    first = [e for e in effects[:done] if e in replayed]
-    whole, said = list[Trace](), ""
+    replay_effects = [e for e in effects if original.find_effect(e).port not in UNREPLAYED]
+    first = [e for e in effects[:done] if e in replay_effects]
+    whole, description = list[Trace](), ""
     if can_be_cut(est, original):
         whole = [est, *repeats]
-        excerpt = choose_search_excerpt(original, est, replayed, progress)
-        said = excerpt.describe(est)
+        excerpt = choose_search_excerpt(original, est, replay_effects, progress)
+        description = excerpt.describe(est)
         est, *repeats = (cut_excerpt(run, excerpt) for run in whole)
-    search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats, replayed,
-                    holdout=holdout, whole=whole)
-    model = lean_model(search.model, replayed)
+    search = Search(original.replace({name: value for name, (value, *_) in marks.items()}), est, repeats,
+                    replay_effects, holdout=holdout, whole=whole)
+    model = lean_model(search.model, replay_effects)
     search.problem = replace(search.problem, model=model, workers=search.workers)
     search.repeats = [replace(p, model=model) for p in search.repeats]
     progress("fitting the model as it is", 0.05)
     chain = [search.judge_fit(tuple(first), _start_fit(search, first, begin or {}))]
-    for number, name in enumerate(replayed[len(first):]):
-        progress(f"adding {name}", 0.15 + 0.35 * number / (len(replayed) - len(first)))
+    for number, name in enumerate(replay_effects[len(first):]):
+        progress(f"adding {name}", 0.15 + 0.35 * number / (len(replay_effects) - len(first)))
         chain.append(_add_effect(search, chain[-1], name))
     rounds = LAST_FIT_ROUNDS + EARLIER_FIT_ROUNDS * (len(chain) - 1)
     search.stage = Stage(progress, "last fits, with finer steps", 0.5, 0.95, rounds)
     chain = search.judge_on_all(_finish_chain(search, chain), LAST_FIT_STEPS)
     steps = _list_steps(search, effects, done, chain)
-    return Refit(original, steps, marks, search.estimate_floor(chain[-1]), search, said)
+    return Refit(original, steps, marks, search.estimate_floor(chain[-1]), search, description)
 
 
 def _finish_chain(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -148,16 +148,16 @@ def _finish_chain(search: Search, chain: Sequence[Hypothesis]) -> list[Hypothesi
         again = replace(last, x=place_in_healthy_unit(last.free, last.x))
         last = min(last, finish_fit(search.problem, again, LAST_FIT_ROUNDS, slopes, search.stage),
                    key=lambda fit: fit.cost)
-    done = [search.judge_fit(chain[-1].effects, last)]
-    if search.leave_out_missed_stop(done[0]):
+    hypotheses = [search.judge_fit(chain[-1].effects, last)]
+    if search.leave_out_missed_stop(hypotheses[0]):
         slopes = replace(search.problem, steps=coarse, _lanes={})
         last = finish_fit(search.problem, last, LAST_FIT_ROUNDS, slopes, search.stage)
-        done = [search.judge_fit(chain[-1].effects, last)]
+        hypotheses = [search.judge_fit(chain[-1].effects, last)]
     for h in reversed(chain[:-1]):
-        begun = _choose_nearer_start(search, h.fit, done[0].fit)
-        fit = finish_fit(search.problem, begun, EARLIER_FIT_ROUNDS, slopes, search.stage)
-        done.insert(0, search.judge_fit(h.effects, fit))
-    return done
+        start = _choose_nearer_start(search, h.fit, hypotheses[0].fit)
+        fit = finish_fit(search.problem, start, EARLIER_FIT_ROUNDS, slopes, search.stage)
+        hypotheses.insert(0, search.judge_fit(h.effects, fit))
+    return hypotheses
 
 
 def _choose_nearer_start(search: Search, fit: Fit, other: Fit) -> Fit:
@@ -165,18 +165,18 @@ def _choose_nearer_start(search: Search, fit: Fit, other: Fit) -> Fit:
 
     What the effect gains is then not what the fit without it had left lying about.
     """
-    there = dict(zip([f.name for f in other.free], other.x, strict=True))
-    own = zip(fit.free, fit.x, strict=True)
-    moved = [there.get(f.name, x) if np.isfinite(f.prior) else x for f, x in own]
-    trials = np.array([fit.x, moved])
+    tolerances = dict(zip([f.name for f in other.free], other.x, strict=True))
+    pairs = zip(fit.free, fit.x, strict=True)
+    start = [tolerances.get(f.name, x) if np.isfinite(f.prior) else x for f, x in pairs]
+    trials = np.array([fit.x, start])
     return replace(fit, x=trials[int(np.argmin(search.problem.compute_costs(fit.free, trials)))])
 
 
 def _start_fit(search: Search, effects: Sequence[str], begin: Mapping[str, float]) -> Fit:
     """The model's own unknowns and those of `effects` fitted, from where they were left."""
-    own = [u for name in effects for u in list_effect_unknowns(search.model.find_effect(name), search.model)]
-    taken = {u.name for u in own}
-    free = (*(f for f in list_all_unknowns(search.model) if f.name not in taken), *own)
+    effect_free = [u for name in effects for u in list_effect_unknowns(search.model.find_effect(name), search.model)]
+    names = {u.name for u in effect_free}
+    free = (*(f for f in list_all_unknowns(search.model) if f.name not in names), *effect_free)
     x = np.array([(begin.get(f.name, f.centre) - f.centre) / f.scale for f in free])
     return continue_fit(search.problem, linearise(search.problem, free, x), FIRST)
 
@@ -208,8 +208,8 @@ def _add_effect(search: Search, before: Hypothesis, name: str) -> Hypothesis:
     """
     fit = before.fit
     healthy = linearise(search.problem, fit.free, place_in_healthy_unit(fit.free, fit.x))
-    found = [each for start in (fit, healthy) for each in scan_effects(search.problem, [start], [name])]
-    best = search.judge_fit((*before.effects, name), _fit_best(search, _begin_fits(search, found)))
+    prospects = [each for start in (fit, healthy) for each in scan_effects(search.problem, [start], [name])]
+    best = search.judge_fit((*before.effects, name), _fit_best(search, _begin_fits(search, prospects)))
     if best.is_at_floor:
         return best
     free, sizes = best.fit.free, search.model.find_effect(name).starts
@@ -220,10 +220,10 @@ def _add_effect(search: Search, before: Hypothesis, name: str) -> Hypothesis:
     return search.judge_fit(best.effects, other) if other.cost < best.cost else best
 
 
-def _fit_best(search: Search, begun: Sequence[Fit]) -> Fit:
+def _fit_best(search: Search, starts: Sequence[Fit]) -> Fit:
     """The best of some fits, taken on side by side."""
     alone = replace(search.problem, workers=1, _lanes={})
-    fits = search.map_parallel(lambda fit: finish_fit(alone, continue_fit(alone, fit, FIRST), THEN), begun)
+    fits = search.map_parallel(lambda fit: finish_fit(alone, continue_fit(alone, fit, FIRST), THEN), starts)
     return min(fits, key=lambda fit: fit.cost)
 
 
@@ -239,7 +239,7 @@ def _begin_fits(search: Search, prospects: Sequence[Prospect]) -> list[Fit]:
 
 def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -> dict[str, tuple[float, float, float]]:
     """Parameters of effects that a replay does not show: they are read off the firmware's answers and the positions."""
-    found: dict[str, tuple[float, float, float]] = {}
+    parameters: dict[str, tuple[float, float, float]] = {}
     for name in effects:
         port = model.find_effect(name).port
         if port not in UNREPLAYED:
@@ -250,17 +250,17 @@ def _read_marks(model: Model, effects: Sequence[str], traces: Sequence[Trace]) -
             where = "steps in the measured positions" if port == "reading" else \
                 f"a difference between {drive} and the model's firmware that it explains"
             raise InputError("effect", name, f"{where}; this trace has none")
-        found |= prints[0].parameters
-    return found
+        parameters |= prints[0].parameters
+    return parameters
 
 
 def _list_steps(search: Search, effects: Sequence[str], done: int, chain: Sequence[Hypothesis]) -> tuple[Step, ...]:
     """One for the start and one for each effect; one that a replay does not show leaves its errors as they are."""
-    held = search.measure_holdout(chain)
-    steps, at = [Step(effects[done - 1] if done else None, chain[0], held[0])], 0
+    holdout = search.measure_holdout(chain)
+    steps, at = [Step(effects[done - 1] if done else None, chain[0], holdout[0])], 0
     for name in effects[done:]:
         at += search.model.find_effect(name).port not in UNREPLAYED
-        steps.append(Step(name, chain[at], held[at]))
+        steps.append(Step(name, chain[at], holdout[at]))
     return tuple(steps)
 
 
@@ -303,11 +303,11 @@ class ModelUpdate:
         fit = self.refit.last.hypothesis.fit
         halves = {f.name: INTERVAL_95_SD * EFFECT_INTERVAL_FACTOR * fit.spread(f.name) for f in fit.free}
         values = limit_friction_values(fit.values)
-        own = {name: Value(v, v - halves[name], v + halves[name], "") for name, v in values.items()}
-        return own | dict(self.parameters)
+        intervals = {name: Value(v, v - halves[name], v + halves[name], "") for name, v in values.items()}
+        return intervals | dict(self.parameters)
 
 
-def find_runs(model: Model, known: Provenance, trace: str | None = None, repeats: Sequence[str] = (),
+def find_runs(model: Model, provenance: Provenance, trace: str | None = None, repeats: Sequence[str] = (),
               holdout: str | None = None, signals: Sequence[str] | None = None) -> Runs:
     """The runs to fit: those named, or the ones that the model file was fitted to.
 
@@ -315,7 +315,7 @@ def find_runs(model: Model, known: Provenance, trace: str | None = None, repeats
 
     Args:
         model: the model with its effects; the runs get the model before any effect was added.
-        known: where the model comes from.
+        provenance: where the model comes from.
         trace: the measured run; None for that of the model file.
         repeats: runs of the same command.
         holdout: a run of another command, which no fit sees.
@@ -324,17 +324,17 @@ def find_runs(model: Model, known: Provenance, trace: str | None = None, repeats
     Raises:
         InputError: runs that cannot be used, or none at all.
     """
-    original = remove_all_effects(model, known)
-    if known.trace is None or (trace is not None and read_source(trace).sha256 != known.trace.sha256):
+    original = remove_all_effects(model, provenance)
+    if provenance.trace is None or (trace is not None and read_source(trace).sha256 != provenance.trace.sha256):
         if trace is None:
             raise InputError("TRACE", "", "the measured run to fit (rig add EFFECT TRACE)")
         return read_runs(original, trace, repeats, holdout, signals)
-    known_holdout = known.holdout.file if known.holdout else None
-    return read_runs(original, trace or known.trace.file, repeats or [r.file for r in known.repeats],
-                     holdout or known_holdout, signals or known.signals or None)
+    holdout_file = provenance.holdout.file if provenance.holdout else None
+    return read_runs(original, trace or provenance.trace.file, repeats or [r.file for r in provenance.repeats],
+                     holdout or holdout_file, signals or provenance.signals or None)
 
 
-def add_effects(effects: Sequence[str], runs: Runs, model: Model, known: Provenance, command: str = "",
+def add_effects(effects: Sequence[str], runs: Runs, model: Model, provenance: Provenance, command: str = "",
                 progress: Progress = ignore_progress) -> ModelUpdate:
     """Add effects to a model, in this order, and fit everything again.
 
@@ -342,7 +342,7 @@ def add_effects(effects: Sequence[str], runs: Runs, model: Model, known: Provena
         effects: names of the catalogue.
         runs: from `find_runs`.
         model: the model with the effects that it has already.
-        known: where it comes from.
+        provenance: where it comes from.
         command: what the user typed, for the history of the model file.
         progress: called with the stage and the share done.
 
@@ -351,68 +351,69 @@ def add_effects(effects: Sequence[str], runs: Runs, model: Model, known: Provena
     """
     for name in effects:
         find_effect(name, runs.model.plant)
-    every = [*known.effects, *effects]
-    check_addable(runs.model, every)
-    prepare_effects(runs, every, progress)
-    continues = _continues_ledger(known, runs)
-    done = len(known.effects) if continues else 0
-    r = refit_effects(runs.model, every, runs.est, runs.repeats, runs.holdout, progress, model.values, done)
+    all_effects = [*provenance.effects, *effects]
+    check_addable(runs.model, all_effects)
+    prepare_effects(runs, all_effects, progress)
+    continues = _continues_ledger(provenance, runs)
+    done = len(provenance.effects) if continues else 0
+    r = refit_effects(runs.model, all_effects, runs.est, runs.repeats, runs.holdout, progress, model.values, done)
     rows = [Row(s.effect, s.hypothesis.errors, s.holdout) for s in r.steps]
-    kept = list(known.ledger) if continues else []
+    old_rows = list(provenance.ledger) if continues else []
     notes = (*dict.fromkeys([*runs.notes, *r.search.problem.trace.notes]), *([r.excerpt] if r.excerpt else []))
-    if known.ledger and not continues:
+    if provenance.ledger and not continues:
         notes = (*notes, "these are other runs than those of the ledger: it begins again")
-    return _make_update(r, runs, known, every, [*kept, *rows[bool(kept):]], notes, command, added=tuple(effects))
+    return _make_update(r, runs, provenance, all_effects, [*old_rows, *rows[bool(old_rows):]], notes, command,
+                        added=tuple(effects))
 
 
-def remove_effect_and_refit(name: str, runs: Runs | None, model: Model, known: Provenance, command: str = "",
+def remove_effect_and_refit(name: str, runs: Runs | None, model: Model, provenance: Provenance, command: str = "",
                   progress: Progress = ignore_progress) -> ModelUpdate:
     """Remove an effect from a model; fit the rest again if runs are given, else keep all other values.
 
     Raises:
         InputError: the model has no such effect.
     """
-    model_without, known_without = remove_effect(model, known, name)
+    model_without, provenance_without = remove_effect(model, provenance, name)
     if runs is None:
         note = f"the other parameters keep the values fitted with {name}; give a TRACE to fit them again"
-        return ModelUpdate(model_without, known_without, (), name, None, {}, (), (note,))
-    prepare_effects(runs, known.effects, progress)
-    rows = list(known.ledger) if _continues_ledger(known, runs) else []
+        return ModelUpdate(model_without, provenance_without, (), name, None, {}, (), (note,))
+    prepare_effects(runs, provenance.effects, progress)
+    rows = list(provenance.ledger) if _continues_ledger(provenance, runs) else []
     if not rows:
-        before = refit_effects(runs.model, known.effects, runs.est, runs.repeats, runs.holdout, progress, model.values,
-                               len(known.effects)).last
+        before = refit_effects(runs.model, provenance.effects, runs.est, runs.repeats, runs.holdout, progress,
+                               model.values, len(provenance.effects)).last
         rows = [Row(before.effect, before.hypothesis.errors, before.holdout)]
-    start = runs.model if name in known.effects else remove_effect(runs.model, known, name)[0]
-    left = known_without.effects
-    r = refit_effects(start, left, runs.est, runs.repeats, runs.holdout, progress, model.values, len(left))
+    start = runs.model if name in provenance.effects else remove_effect(runs.model, provenance, name)[0]
+    effects = provenance_without.effects
+    r = refit_effects(start, effects, runs.est, runs.repeats, runs.holdout, progress, model.values, len(effects))
     rows.append(Row(name, r.last.hypothesis.errors, r.last.holdout, True))
-    return _make_update(r, runs, known_without, left, rows, runs.notes, command, removed=name)
+    return _make_update(r, runs, provenance_without, effects, rows, runs.notes, command, removed=name)
 
 
-def _continues_ledger(known: Provenance, runs: Runs) -> bool:
+def _continues_ledger(provenance: Provenance, runs: Runs) -> bool:
     """Whether the ledger goes on: the same runs, told by their content, and the same signals."""
-    own = [s.sha256 for s in (known.trace, *known.repeats, known.holdout) if s]
-    return (bool(known.ledger) and own == [s.sha256 for s in runs.sources]
-            and len(known.repeats) == len(runs.repeats) and known.signals == tuple(runs.est.outputs))
+    hashes = [s.sha256 for s in (provenance.trace, *provenance.repeats, provenance.holdout) if s]
+    return (bool(provenance.ledger) and hashes == [s.sha256 for s in runs.sources]
+            and len(provenance.repeats) == len(runs.repeats) and provenance.signals == tuple(runs.est.outputs))
 
 
-def _make_update(r: Refit, runs: Runs, known: Provenance, effects: Sequence[str], rows: Sequence[Row],
+def _make_update(r: Refit, runs: Runs, provenance: Provenance, effects: Sequence[str], rows: Sequence[Row],
                  notes: tuple[str, ...], command: str, added: tuple[str, ...] = (), removed: str = "") -> ModelUpdate:
     model, fit = r.original.replace(list_fitted_values(r), "fit"), r.last.hypothesis.fit
     parameters = {name: v for e in effects for name, v in list_fitted_parameters(e, fit, runs.model).items()}
     parameters |= {name: Value(*of, find_quantity(name, plant=model.plant).unit) for name, of in r.marks.items()}
     before = {name: runs.model[name] for name in fit.values if name in runs.model.values}
-    known_floor = known.floor or {}
+    old_floor = provenance.floor or {}
     floor = dict(r.floor)
     if len(rows) > len(r.steps):  # a model that lacks an effect overestimates the noise: the lowest floor is the noise
-        floor = {s: min(x, known_floor.get(s, x)) for s, x in r.floor.items()}
-    provenance = replace(
-        known, software=name_software(), history=(*known.history, *([command] if command else [])),
+        floor = {s: min(x, old_floor.get(s, x)) for s, x in r.floor.items()}
+    new_provenance = replace(
+        provenance, software=name_software(), history=(*provenance.history, *([command] if command else [])),
         effects=tuple(effects), signals=runs.est.outputs, trace=runs.sources[0],
         repeats=runs.sources[1:1 + len(runs.repeats)],
         holdout=runs.sources[-1] if runs.holdout is not None else None, floor=floor,
-        before={**(known.before or {}), **before}, ledger=tuple(rows))
-    return ModelUpdate(model, provenance, added, removed, r, parameters, list_suspicious(fit, model.plant), notes)
+        before={**(provenance.before or {}), **before}, ledger=tuple(rows))
+    return ModelUpdate(model, new_provenance, added, removed, r, parameters, list_suspicious(fit, model.plant), notes)
 
 
 def write_model_file(update: ModelUpdate, path: str | Path) -> Path | None:
@@ -465,22 +466,22 @@ def read_provenance(path: Path) -> Provenance:
     Raises:
         InputError: a table that this software did not write.
     """
-    said = read_model_tables(path).get("provenance", {})
+    table = read_model_tables(path).get("provenance", {})
     try:
-        runs = [Source(*pair) for pair in zip(said.get("repeats", []), said.get("repeats_sha256", []), strict=True)]
+        runs = [Source(*pair) for pair in zip(table.get("repeats", []), table.get("repeats_sha256", []), strict=True)]
         rows = [Row(r.get("effect"), r["error"], r.get("holdout", {}), r.get("removed", False))
-                for r in said.get("ledger", [])]
-        history, effects, files, signals = (tuple(said.get(name, ())) for name in
+                for r in table.get("ledger", [])]
+        history, effects, files, signals = (tuple(table.get(name, ())) for name in
                                             ("history", "effects", "effect_files", "signals"))
-        trace, holdout = _read_source(said, "trace"), _read_source(said, "holdout")
-        return Provenance(said.get("software", ""), history, effects, files, signals, trace, tuple(runs), holdout,
-                          said.get("floor"), said.get("before"), tuple(rows), said.get("identification"))
+        trace, holdout = _read_source(table, "trace"), _read_source(table, "holdout")
+        return Provenance(table.get("software", ""), history, effects, files, signals, trace, tuple(runs), holdout,
+                          table.get("floor"), table.get("before"), tuple(rows), table.get("identification"))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(path, "provenance", f"what rig add writes there ({error})") from error
 
 
-def _read_source(said: Mapping[str, Any], name: str) -> Source | None:
-    return Source(said[name], said[f"{name}_sha256"]) if name in said else None
+def _read_source(table: Mapping[str, Any], name: str) -> Source | None:
+    return Source(table[name], table[f"{name}_sha256"]) if name in table else None
 
 
 def load_model_file(path: Path) -> tuple[Model, Provenance]:
@@ -489,22 +490,23 @@ def load_model_file(path: Path) -> tuple[Model, Provenance]:
     Raises:
         InputError: a file that cannot be used, or a user's effect in it that nothing has loaded.
     """
-    found = read_provenance(path)
+    provenance = read_provenance(path)
     tables = read_model_tables(path)
-    named = tables.get("effects", [])
+    names = tables.get("effects", [])
     plant = tables.get("plant", "eha")
-    own = find_plant(plant).effects if plant in list_plants() else CATALOGUE.of_plants
-    gone = [e for e in named if e not in CATALOGUE.list_all() and e not in own] if isinstance(named, list) else []
-    if gone and found.effect_files:
-        files = " ".join(f"--effects {file}" for file in found.effect_files)
-        raise InputError(path, "effects", f"{files} with it, where {gone[0]} is defined")
-    return parse_model(tables, path, path.stem), found
+    plant_effects = find_plant(plant).effects if plant in list_plants() else CATALOGUE.of_plants
+    unknown_names = ([e for e in names if e not in CATALOGUE.list_all() and e not in plant_effects]
+                     if isinstance(names, list) else [])
+    if unknown_names and provenance.effect_files:
+        files = " ".join(f"--effects {file}" for file in provenance.effect_files)
+        raise InputError(path, "effects", f"{files} with it, where {unknown_names[0]} is defined")
+    return parse_model(tables, path, path.stem), provenance
 
 
 def remove_all_effects(model: Model, p: Provenance) -> Model:
     """The model as it was before any effect was added, tolerances included."""
-    theirs = {name for e in map(model.find_effect, p.effects) if not e.base for name in e.off}
-    values = {name: value for name, value in {**model.values, **(p.before or {})}.items() if name not in theirs}
+    parameters = {name for e in map(model.find_effect, p.effects) if not e.base for name in e.off}
+    values = {name: value for name, value in {**model.values, **(p.before or {})}.items() if name not in parameters}
     return replace(model, values=values, effects=tuple(e for e in model.effects if e not in p.effects))
 
 
@@ -517,40 +519,40 @@ def remove_effect(model: Model, p: Provenance, name: str) -> tuple[Model, Proven
     entry = model.find_effect(name)
     if not entry.base and name in model.effects:
         values = {n: v for n, v in model.values.items() if n not in entry.off}
-        found = replace(model, values=values, effects=tuple(e for e in model.effects if e != name))
+        model_without = replace(model, values=values, effects=tuple(e for e in model.effects if e != name))
     elif entry.base and (name in p.effects or any(model[n] != model.nominal[n] for n in entry.fitted)):
         usual = {n: (p.before or {}).get(n, model.nominal[n]) for n in entry.fitted}
-        found = replace(model, values=limit_friction_values({**model.values, **usual}))
+        model_without = replace(model, values=limit_friction_values({**model.values, **usual}))
     else:
-        has = ", ".join(dict.fromkeys([*p.effects, *model.effects])) or "it has none"
-        raise InputError("effect", name, f"one that the model has ({has})")
-    return found, replace(p, effects=tuple(e for e in p.effects if e != name))
+        names = ", ".join(dict.fromkeys([*p.effects, *model.effects])) or "it has none"
+        raise InputError("effect", name, f"one that the model has ({names})")
+    return model_without, replace(p, effects=tuple(e for e in p.effects if e != name))
 
 
 def format_model_file(model: Model, intervals: Mapping[str, Value], p: Provenance,
                       remarks: Mapping[str, str] | None = None) -> str:
     """The model file's text, 95 % intervals beside what was fitted, and further remarks beside other parameters."""
-    said = {name: f"{v.low:.6g} .. {v.high:.6g} (95 %)" for name, v in intervals.items()}
-    return "\n".join([model.to_toml({**said, **(remarks or {})}), *_format_provenance(p)]) + "\n"
+    interval_remarks = {name: f"{v.low:.6g} .. {v.high:.6g} (95 %)" for name, v in intervals.items()}
+    return "\n".join([model.to_toml({**interval_remarks, **(remarks or {})}), *_format_provenance(p)]) + "\n"
 
 
 def _format_provenance(p: Provenance) -> list[str]:
     """The lines of [provenance]."""
     runs = {"trace": p.trace, "holdout": p.holdout}
-    said = {"software": p.software, "history": p.history, "effects": p.effects}
+    entries = {"software": p.software, "history": p.history, "effects": p.effects}
     more = {"effect_files": p.effect_files, "signals": p.signals,
             **{name + end: value for name, run in runs.items() if run
                for end, value in (("", run.file), ("_sha256", run.sha256))},
             "repeats": [r.file for r in p.repeats], "repeats_sha256": [r.sha256 for r in p.repeats], "floor": p.floor}
-    lines = ["[provenance]", *_format_values(said | {name: value for name, value in more.items() if value})]
+    lines = ["[provenance]", *_format_values(entries | {name: value for name, value in more.items() if value})]
     if p.before:
         lines += ["", "[provenance.before]", *(f"{quote_text(name)} = {value!r}" for name, value in p.before.items())]
     if p.identification:
         lines += ["", "[provenance.identification]", *_format_values(p.identification)]
     for row in p.ledger:
-        known = {"effect": row.effect, "removed": row.removed, "error": row.error, "holdout": row.holdout}
+        fields = {"effect": row.effect, "removed": row.removed, "error": row.error, "holdout": row.holdout}
         lines += ["", "[[provenance.ledger]]",
-                  *_format_values({name: value for name, value in known.items() if value or name == "error"})]
+                  *_format_values({name: value for name, value in fields.items() if value or name == "error"})]
     return lines
 
 
