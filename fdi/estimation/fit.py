@@ -89,8 +89,8 @@ def limit_dynamic_friction(names: Sequence[str], values: Floats) -> Floats:
 def limit_friction_values(values: Mapping[str, float]) -> dict[str, float]:
     """Parameters by name, in which dynamic friction is at most the static friction."""
     names = [name for name in values if name.endswith("_friction")]
-    limited = limit_dynamic_friction(names, np.array([values[name] for name in names]))
-    return {**values, **dict(zip(names, limited.tolist(), strict=True))}
+    frictions = limit_dynamic_friction(names, np.array([values[name] for name in names]))
+    return {**values, **dict(zip(names, frictions.tolist(), strict=True))}
 
 
 @cache
@@ -131,8 +131,8 @@ class Problem:
     def predict_outputs(self, names: Sequence[str], values: Floats) -> Floats:
         """Replays with the named parameters at `values` (m, p): (m, s, n) in SI units."""
         def predict_run(run: Trace) -> Floats:
-            every, columns = self.predict_signals(names, values, run), run.output_columns
-            return every if columns == list(range(every.shape[1])) else every[:, columns]
+            outputs, columns = self.predict_signals(names, values, run), run.output_columns
+            return outputs if columns == list(range(outputs.shape[1])) else outputs[:, columns]
 
         runs = map_in_threads(predict_run, (self.trace, *self.also), self.workers)
         return np.concatenate(runs, axis=-1) if self.also else runs[0]
@@ -141,8 +141,8 @@ class Problem:
         """All outputs of one run (default: the first), as its sensors show them, measured or not: (m, outputs, n)."""
         key = tuple(names)
         if key not in self._lanes:
-            bare = self.bare is not None and set(key) <= set(self.bare.values)
-            self._lanes[key] = Lanes(self.bare if bare and self.bare else self.model, key,
+            is_bare = self.bare is not None and set(key) <= set(self.bare.values)
+            self._lanes[key] = Lanes(self.bare if is_bare and self.bare else self.model, key,
                                      max(self.steps, find_fewest_steps(self.model.kind)), self.workers)
         trace = self.trace if trace is None else trace
         out = self._lanes[key].replay(values, trace.drive, trace.load, trace.anchor, self.anchor, trace.parts,
@@ -164,11 +164,11 @@ class Problem:
         """The same, whitened: (m, s, n), 0 where not measured."""
         return self.whiten_predictions(self.predict_unknowns(free, x))
 
-    def whiten_predictions(self, predicted: Floats) -> Floats:
+    def whiten_predictions(self, predictions: Floats) -> Floats:
         """Whitened residuals of predictions, (m, s, n), 0 where not measured."""
-        white = np.empty(predicted.shape)
-        for few in cut_runs(predicted.shape):
-            self._whiten(self.subtract_measurements(predicted[few]), white[few])
+        white = np.empty(predictions.shape)
+        for runs in cut_runs(predictions.shape):
+            self._whiten(self.subtract_measurements(predictions[runs]), white[runs])
         return white
 
     def compute_costs(self, free: Sequence[Free], x: Floats) -> Floats:
@@ -184,17 +184,17 @@ class Problem:
         values = np.array([[f.value(v) for f, v in zip(free, row, strict=True)] for row in x])
         return limit_dynamic_friction([f.name for f in free], values)
 
-    def subtract_measurements(self, predicted: Floats) -> Floats:
-        """Predicted minus measured, without steady lines of the mains, (m, s, n) as `predicted`: the misfit of a fit.
+    def subtract_measurements(self, predictions: Floats) -> Floats:
+        """Predicted minus measured, without steady lines of the mains, (m, s, n) as `predictions`: the misfit of a fit.
 
         Its slope is that of the prediction. What a report shows is the residual, measured minus model.
         """
         # an observer's replay that bounces otherwise than the measured motor is off by far more than any hum
         most = HUM_MOST_SD if self.model.kind.correct is not None else np.inf
         limits = most * np.array([n.level for n in self.noise])
-        residuals, start, period = np.empty(predicted.shape), 0, self.model.values["controller.period"]
+        residuals, start, period = np.empty(predictions.shape), 0, self.model.values["controller.period"]
         for trace in (self.trace, *self.also):
-            np.subtract(predicted[..., start:start + len(trace)], trace.measurements,
+            np.subtract(predictions[..., start:start + len(trace)], trace.measurements,
                         out=residuals[..., start:start + len(trace)])
             for part in trace.parts or _cut_rows(len(trace)):
                 remove_mains(residuals, start + part.first, start + part.stop, period, limits)
@@ -228,8 +228,8 @@ def span_all_rows(trace: Trace) -> Part:
 
 def cut_runs(shape: Sequence[int], most: int = 120_000) -> list[slice]:
     """The runs of an array (m, s, n) a few at a time, so that the processor's cache holds all that is made of them."""
-    few = max(1, most // (shape[1] * shape[2]))
-    return [slice(first, first + few) for first in range(0, shape[0], few)]
+    count = max(1, most // (shape[1] * shape[2]))
+    return [slice(first, first + count) for first in range(0, shape[0], count)]
 
 
 def _cut_rows(rows: int, most: int = 60_000) -> list[Part]:
@@ -247,8 +247,8 @@ def cut_blocks(white: Floats, block: int = BLOCK) -> Floats:
 
 def sum_blocks(white: Floats, block: int = BLOCK) -> Floats:
     """Sums of squares of whitened residuals (.., n) over blocks of so many: (.., b)."""
-    cut = cut_blocks(white, block)
-    sums: Floats = np.einsum("...i,...i->...", cut, cut)
+    blocks = cut_blocks(white, block)
+    sums: Floats = np.einsum("...i,...i->...", blocks, blocks)
     return sums
 
 
@@ -267,8 +267,8 @@ def weigh_blocks(white: Floats, block: int = BLOCK) -> Floats:
     Of residuals at fewer samples, `block` is the number of them in a block.
     """
     sums = sum_blocks(white, block)
-    each: Floats = np.minimum(1.0, BLOCK_FITTED_SQUARE * block / np.maximum(sums, 1e-300))
-    return each
+    weights: Floats = np.minimum(1.0, BLOCK_FITTED_SQUARE * block / np.maximum(sums, 1e-300))
+    return weights
 
 
 def compute_weights(white: Floats) -> Floats:
@@ -292,14 +292,14 @@ UNREPLAYED = ("command", "reading")  # ports that a replay from the measured cur
 
 def list_relative_tolerances(model: Model, names: Iterable[str]) -> dict[str, float]:
     """Of the named parameters those that differ from one healthy unit to the next, with one tolerance as a fraction."""
-    found = {name: model.kind.find_tolerance(name, find_quantity(name, plant=model.plant)) for name in names}
-    return {name: tolerance for name, tolerance in found.items() if tolerance > 0.0}
+    tolerances = {name: model.kind.find_tolerance(name, find_quantity(name, plant=model.plant)) for name in names}
+    return {name: tolerance for name, tolerance in tolerances.items() if tolerance > 0.0}
 
 
 def list_tolerance_sizes(model: Model) -> dict[str, float]:
     """The parameters that differ from one healthy unit to the next, with one tolerance in SI units."""
-    found = list_relative_tolerances(model, model.list_names())
-    sizes = {name: tolerance * abs(model[name]) for name, tolerance in found.items()}
+    sizes = {name: tolerance * abs(model[name])
+             for name, tolerance in list_relative_tolerances(model, model.list_names()).items()}
     return {name: size for name, size in sizes.items() if size > 0.0}
 
 
@@ -308,11 +308,11 @@ def list_tolerance_unknowns(model: Model) -> tuple[Free, ...]:
 
     The tolerance is a fraction of the nominal value, so that it does not depend on the model's own.
     """
-    usual = model.nominal
+    nominal = model.nominal
     free = []
     for name, tolerance in list_relative_tolerances(model, model.values).items():
         value, q = model.values[name], find_quantity(name, plant=model.plant)
-        scale = tolerance * (abs(usual.get(name, value)) or 1.0)
+        scale = tolerance * (abs(nominal.get(name, value)) or 1.0)
         low, high = value - HEALTHY_TOLERANCES * scale, value + HEALTHY_TOLERANCES * scale
         free.append(Free(name, value, scale, 1.0, max(q.low, q.above, low), min(q.high, q.below, high), 0.3))
     return tuple(free)
@@ -323,9 +323,9 @@ def list_effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) ->
 
     `turning`, Hz, is the first difference of a frequency: a small part of a turn over a test.
     """
-    usual, free = model.nominal, []
+    nominal, free = model.nominal, []
     for name in effect.fitted:
-        q, off = effect.parameters[name], effect.off.get(name, usual.get(name, 0.0))
+        q, off = effect.parameters[name], effect.off.get(name, nominal.get(name, 0.0))
         sizes = sorted(abs(start[name] - off) for start in effect.starts)
         scale = (sizes[len(sizes) // 2] if sizes else abs(model[name] - off)) or 1.0
         step = turning / scale if q.unit == "Hz" else 0.05
@@ -335,11 +335,11 @@ def list_effect_unknowns(effect: Effect, model: Model, turning: float = 2e-3) ->
 
 def name_sine(entry: Effect) -> tuple[str, str, str] | None:
     """Names of the amplitude, the frequency and the phase of an effect that has them."""
-    named = {entry.parameters[n].unit: n for n in entry.fitted}
-    size = next((n for n in entry.fitted if entry.parameters[n].unit not in ("Hz", "rad")), None)
-    if size is None or not {"Hz", "rad"} <= set(named) or not entry.starts:
+    names = {entry.parameters[n].unit: n for n in entry.fitted}
+    amplitude = next((n for n in entry.fitted if entry.parameters[n].unit not in ("Hz", "rad")), None)
+    if amplitude is None or not {"Hz", "rad"} <= set(names) or not entry.starts:
         return None
-    return size, named["Hz"], named["rad"]
+    return amplitude, names["Hz"], names["rad"]
 
 
 def turn_amplitudes_positive(free: Sequence[Free], x: Floats, effects: Iterable[Effect]) -> Floats:
@@ -364,21 +364,21 @@ def list_active_effects(model: Model) -> tuple[str, ...]:
 
 def list_active_unknowns(model: Model) -> tuple[Free, ...]:
     """The parameters of the active effects as unknowns of a fit, from their present values and without prior."""
-    replayed = [e for e in map(model.find_effect, list_active_effects(model)) if e.port not in UNREPLAYED]
-    return tuple(u._replace(centre=model[u.name]) for e in replayed for u in list_effect_unknowns(e, model))
+    effects = [e for e in map(model.find_effect, list_active_effects(model)) if e.port not in UNREPLAYED]
+    return tuple(u._replace(centre=model[u.name]) for e in effects for u in list_effect_unknowns(e, model))
 
 
 def list_all_unknowns(model: Model) -> tuple[Free, ...]:
     """All that is free in a model: tolerances, and the parameters of the effects that it has."""
-    own = list_active_unknowns(model)
-    taken = {u.name for u in own}
-    return (*(f for f in list_tolerance_unknowns(model) if f.name not in taken), *own)
+    active_unknowns = list_active_unknowns(model)
+    names = {u.name for u in active_unknowns}
+    return (*(f for f in list_tolerance_unknowns(model) if f.name not in names), *active_unknowns)
 
 
 def _is_off_nominal(e: Effect, model: Model) -> bool:
-    usual = model.nominal
+    nominal = model.nominal
     tolerance = model.kind.find_tolerance
-    return any(abs(model[name] - usual[name]) > (HEALTHY_TOLERANCES * tolerance(name, q) + 1e-12) * abs(usual[name])
+    return any(abs(model[name] - nominal[name]) > (HEALTHY_TOLERANCES * tolerance(name, q) + 1e-12) * abs(nominal[name])
                for name, q in e.parameters.items())
 
 
@@ -450,27 +450,27 @@ def fit_unknowns(problem: Problem, free: Sequence[Free], start: Floats | None = 
     return continue_fit(problem, _begin_fit(problem, free, x), rounds)
 
 
-def continue_fit(problem: Problem, now: Fit, rounds: int = FIT_ROUNDS) -> Fit:
+def continue_fit(problem: Problem, fit: Fit, rounds: int = FIT_ROUNDS) -> Fit:
     """A fit after so many further rounds, or fewer if it converges."""
     for _ in range(rounds):
-        gradient, hessian = form_normal_equations(now)
-        best = find_best_trial(problem, now, step_within_bounds(now, hessian, gradient))
-        gained = now.cost - best.cost
-        if gained < max(CONVERGED_GAIN, CONVERGED_SHARE * now.cost):
-            return replace(best if gained > 0.0 else now, converged=True, covariance=_invert(hessian))
-        now = _differentiate(problem, best, _choose_widths(now.free, hessian))
-    return _add_covariance(now)
+        gradient, hessian = form_normal_equations(fit)
+        best = find_best_trial(problem, fit, step_within_bounds(fit, hessian, gradient))
+        gain = fit.cost - best.cost
+        if gain < max(CONVERGED_GAIN, CONVERGED_SHARE * fit.cost):
+            return replace(best if gain > 0.0 else fit, converged=True, covariance=_invert(hessian))
+        fit = _differentiate(problem, best, _choose_widths(fit.free, hessian))
+    return _add_covariance(fit)
 
 
 def find_best_trial(problem: Problem, fit: Fit, trials: Floats) -> Fit:
     """The fit at the best of the trials (m, p); its Jacobian and covariance stay as they are."""
-    predicted = problem.predict_unknowns(fit.free, trials)
-    white = problem.whiten_predictions(predicted)
-    held = compute_misfit(white)
-    costs = held + trials**2 @ weigh_priors(fit.free)
+    predictions = problem.predict_unknowns(fit.free, trials)
+    white = problem.whiten_predictions(predictions)
+    misfits = compute_misfit(white)
+    costs = misfits + trials**2 @ weigh_priors(fit.free)
     k = int(np.argmin(costs))
-    return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(held[k]),
-                   residuals=problem.subtract_measurements(predicted[k:k + 1])[0], white=white[k].copy())
+    return replace(fit, x=trials[k], cost=float(costs[k]), misfit=float(misfits[k]),
+                   residuals=problem.subtract_measurements(predictions[k:k + 1])[0], white=white[k].copy())
 
 
 def linearise(problem: Problem, free: Sequence[Free], x: Floats) -> Fit:
@@ -480,13 +480,13 @@ def linearise(problem: Problem, free: Sequence[Free], x: Floats) -> Fit:
 
 def _begin_fit(problem: Problem, free: Sequence[Free], x: Floats) -> Fit:
     moves = _choose_moves(free, x, np.array([f.step for f in free]))
-    predicted = problem.predict_unknowns(free, np.vstack([x, x + np.diag(moves)]))
-    white = problem.whiten_predictions(predicted)
-    held = float(compute_misfit(white[:1])[0])
+    predictions = problem.predict_unknowns(free, np.vstack([x, x + np.diag(moves)]))
+    white = problem.whiten_predictions(predictions)
+    misfit = float(compute_misfit(white[:1])[0])
     none = np.empty(0)  # Jacobian and covariance follow
-    begun = Fit(tuple(free), x, held + float(x**2 @ weigh_priors(free)), held, none,
-                problem.subtract_measurements(predicted[:1])[0], white[0].copy(), none)
-    return _take_differences(begun, white[1:], moves)
+    fit = Fit(tuple(free), x, misfit + float(x**2 @ weigh_priors(free)), misfit, none,
+                problem.subtract_measurements(predictions[:1])[0], white[0].copy(), none)
+    return _take_differences(fit, white[1:], moves)
 
 
 def _differentiate(problem: Problem, fit: Fit, step: Floats) -> Fit:
@@ -501,11 +501,11 @@ def _choose_moves(free: Sequence[Free], x: Floats, step: Floats) -> Floats:
     return np.where(is_high, -step, step)
 
 
-def _take_differences(fit: Fit, moved: Floats, moves: Floats) -> Fit:
+def _take_differences(fit: Fit, white: Floats, moves: Floats) -> Fit:
     """The fit with its Jacobian from the whitened residuals (p, s, n), used up, after each move (p,)."""
-    moved -= fit.white
-    moved /= moves[:, None, None]
-    return replace(fit, jacobian=moved)
+    white -= fit.white
+    white /= moves[:, None, None]
+    return replace(fit, jacobian=white)
 
 
 def replay_fit(problem: Problem, fit: Fit, x: Floats) -> Fit:
@@ -526,8 +526,8 @@ def _add_covariance(fit: Fit) -> Fit:
 
 
 def _invert(hessian: Floats) -> Floats:
-    found = np.asarray(np.linalg.pinv(hessian), np.float64)
-    return invert_hessian(hessian) if (np.diag(found) < 0.0).any() else found
+    covariance = np.asarray(np.linalg.pinv(hessian), np.float64)
+    return invert_hessian(hessian) if (np.diag(covariance) < 0.0).any() else covariance
 
 
 def invert_hessian(hessian: Floats) -> Floats:
@@ -544,25 +544,26 @@ def invert_hessian(hessian: Floats) -> Floats:
 def _choose_widths(free: Sequence[Free], hessian: Floats) -> Floats:
     widest = np.array([f.step for f in free])
     difference_width_sd = 3.0  # of a parameter: differences wide enough for stick-slip, narrow at the end
-    wanted = difference_width_sd / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
-    return np.clip(wanted, 0.01 * widest, widest)  # times the first width
+    widths = difference_width_sd / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
+    return np.clip(widths, 0.01 * widest, widest)  # times the first width
 
 
 def step_within_bounds(fit: Fit, hessian: Floats, gradient: Floats, dampings: Sequence[float] = DAMPINGS) -> Floats:
     """Damped Gauss-Newton steps within the bounds, (m, p): what runs into one stays there, the rest is solved again."""
     low, high = scaled_bounds(fit.free)
     diagonal = np.outer(dampings, np.diag(hessian)) + 1e-12 * np.trace(hessian) + 1e-12
-    damped = hessian + diagonal[:, None, :] * np.eye(len(gradient))
-    x, open_ = np.tile(fit.x, (len(dampings), 1)), np.ones((len(dampings), len(fit.x)), bool)
+    damped_hessian = hessian + diagonal[:, None, :] * np.eye(len(gradient))
+    x, is_open = np.tile(fit.x, (len(dampings), 1)), np.ones((len(dampings), len(fit.x)), bool)
     for _ in fit.x:
-        held = np.where(open_, 0.0, x - fit.x)
-        own = np.where(open_[:, :, None] & open_[:, None, :], damped, ~open_[:, :, None] * np.eye(len(gradient)))
-        right = np.where(open_, -gradient - (damped @ held[:, :, None])[..., 0], held)
-        x = fit.x + np.linalg.solve(own, right[..., None])[..., 0]
-        out = open_ & ((x < low) | (x > high))
+        bound_steps = np.where(is_open, 0.0, x - fit.x)
+        matrix = np.where(is_open[:, :, None] & is_open[:, None, :], damped_hessian,
+                          ~is_open[:, :, None] * np.eye(len(gradient)))
+        right_side = np.where(is_open, -gradient - (damped_hessian @ bound_steps[:, :, None])[..., 0], bound_steps)
+        x = fit.x + np.linalg.solve(matrix, right_side[..., None])[..., 0]
+        is_out = is_open & ((x < low) | (x > high))
         x = np.clip(x, low, high)
-        open_ &= ~out
-        if not out.any():
+        is_open &= ~is_out
+        if not is_out.any():
             break
     return x
 
@@ -590,8 +591,8 @@ def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, see
     size = min(64, 16 * -(-len(fit.x) // 4))  # trials of a generation, whole blocks of lanes; few unknowns need few
     low, high = scaled_bounds(fit.free)
     rng, n = np.random.default_rng(seed), len(fit.x)
-    kept = size // 2
-    weights = np.log(kept + 0.5) - np.log(np.arange(1, kept + 1))
+    parents = size // 2
+    weights = np.log(parents + 0.5) - np.log(np.arange(1, parents + 1))
     weights /= weights.sum()
     effective = 1.0 / float((weights**2).sum())
     path_rate = (4.0 + effective / n) / (n + 4.0 + 2.0 * effective / n)
@@ -613,19 +614,19 @@ def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, see
         idle = 0 if gain > max(CONVERGED_GAIN, CONVERGED_SHARE * float(costs[order[0]])) else idle + 1
         if gain > 0.0:
             best, best_cost = trials[order[0]], float(costs[order[0]])
-        moves = (trials[order[:kept]] - centre) / step
+        moves = (trials[order[:parents]] - centre) / step
         move = weights @ moves
         centre = centre + step * move
-        along = axes @ ((axes.T @ move) / lengths)
-        step_path = (1.0 - step_rate) * step_path + np.sqrt(step_rate * (2.0 - step_rate) * effective) * along
+        white_move = axes @ ((axes.T @ move) / lengths)
+        step_path = (1.0 - step_rate) * step_path + np.sqrt(step_rate * (2.0 - step_rate) * effective) * white_move
         length = float(np.linalg.norm(step_path))
-        begun = np.sqrt(1.0 - (1.0 - step_rate) ** (2 * generation))
-        is_short = length / begun < (1.4 + 2.0 / (n + 1.0)) * usual_length
+        start_factor = np.sqrt(1.0 - (1.0 - step_rate) ** (2 * generation))
+        is_short = length / start_factor < (1.4 + 2.0 / (n + 1.0)) * usual_length
         path = (1.0 - path_rate) * path
         if is_short:
             path += np.sqrt(path_rate * (2.0 - path_rate) * effective) * move
-        lost = 0.0 if is_short else path_rate * (2.0 - path_rate)
-        spread = ((1.0 - rank_one - rank_many + rank_one * lost) * spread + rank_one * np.outer(path, path)
+        missing_variance = 0.0 if is_short else path_rate * (2.0 - path_rate)
+        spread = ((1.0 - rank_one - rank_many + rank_one * missing_variance) * spread + rank_one * np.outer(path, path)
                   + rank_many * (moves.T * weights) @ moves)
         step *= float(np.exp(min(1.0, step_rate / damping * (length / usual_length - 1.0))))
         if idle >= patience:
@@ -633,22 +634,21 @@ def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, see
     return replace(fit, x=best, cost=best_cost, covariance=step**2 * spread)
 
 
-def follow_population(problem: P, begun: Fit, spread: Floats, stages: Sequence[tuple[float, int]], seed: int,
+def follow_population(problem: P, fit: Fit, spread: Floats, stages: Sequence[tuple[float, int]], seed: int,
                       descend: Callable[[P, Fit, int, float], Fit]) -> Fit:
     """The fit at which a population ends whose noise counts for less from stage to stage.
 
     Args:
         problem: the run, with its own noise.
-        begun: where the first trials are centred.
+        fit: where the first trials are centred.
         spread: their covariance, (p, p).
         stages: factor on the noise and generations, each.
         seed: of the trials.
         descend: takes a fit of a problem so many rounds further, with its noise so many times as large.
     """
-    fit = begun
     for number, (factor, generations) in enumerate(stages):
-        found = evolve_fit(scale_noise(problem, factor), fit, spread, generations, 10 * seed + number)
-        spread = 4.0 * found.covariance
-        slid = descend(problem, found, 2, factor)
-        fit = slid if slid.cost < found.cost else found
+        best = evolve_fit(scale_noise(problem, factor), fit, spread, generations, 10 * seed + number)
+        spread = 4.0 * best.covariance
+        end = descend(problem, best, 2, factor)
+        fit = end if end.cost < best.cost else best
     return fit

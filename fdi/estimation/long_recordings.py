@@ -77,14 +77,14 @@ def replay_in_turns(lanes: Lanes, values: Floats, trace: Trace, position: Floats
         whole = trace.pass_sensors(out)
         yield from ((first, whole[:, first:first + rows]) for first in range(0, len(trace), rows))
         return
-    before = np.empty((len(values), 0, len(trace.output_names)))  # what a filtering sensor remembers
+    memory = np.empty((len(values), 0, len(trace.output_names)))  # what a filtering sensor remembers
     for first, out in lanes.replay_in_turns(values, trace.drive, trace.load, position, anchor, rows, trace.slack):
         if not trace.sensors:
             yield first, out
             continue
-        known = np.concatenate([before, out], axis=1)
-        yield first, trace.pass_sensors(known)[:, before.shape[1]:]
-        before = known[:, -SENSOR_MEMORY:]
+        history = np.concatenate([memory, out], axis=1)
+        yield first, trace.pass_sensors(history)[:, memory.shape[1]:]
+        memory = history[:, -SENSOR_MEMORY:]
 
 
 class Excerpt(NamedTuple):
@@ -114,30 +114,30 @@ def choose_excerpt(trace: Trace, model: Model, floor: Mapping[str, float], chang
     """
     rows = round(PIECE / trace.period)
     starts = np.arange(0, len(trace) - rows + 1, rows)
-    information, misfit, measured = _measure_information(trace, model, floor, list(changes), rows, len(starts),
-                                                         progress)
-    full = measured >= 0.5 * measured.max()  # of rows that come every few cycles, not every one is measured
+    information, misfit, shares = _measure_information(trace, model, floor, list(changes), rows, len(starts),
+                                                       progress)
+    is_full = shares >= 0.5 * shares.max()  # of rows that come every few cycles, not every one is measured
     leads = np.array([first - _find_lead_in(trace, first) for first in starts.tolist()])
     is_near = leads <= SHORT_LEAD_IN / trace.period
-    if (full & is_near).sum() > 2 * PIECES:
-        full &= is_near
-    chosen = _choose_pieces(information, full)
-    rest = np.where(full, misfit, -np.inf)
-    rest[chosen] = -np.inf
+    if (is_full & is_near).sum() > 2 * PIECES:
+        is_full &= is_near
+    pieces = _choose_pieces(information, is_full)
+    rest = np.where(is_full, misfit, -np.inf)
+    rest[pieces] = -np.inf
     if np.isfinite(rest).any():
-        chosen.append(int(np.argmax(rest)))
-    return make_excerpt((int(starts[k]), int(starts[k]) + rows) for k in chosen)
+        pieces.append(int(np.argmax(rest)))
+    return make_excerpt((int(starts[k]), int(starts[k]) + rows) for k in pieces)
 
 
 def make_excerpt(pieces: Iterable[tuple[int, int]]) -> Excerpt:
     """An excerpt of these rows; pieces that touch are joined."""
-    joined: list[tuple[int, int]] = []
+    spans: list[tuple[int, int]] = []
     for first, stop in sorted(set(pieces)):
-        if joined and first <= joined[-1][1]:
-            joined[-1] = (joined[-1][0], max(stop, joined[-1][1]))
+        if spans and first <= spans[-1][1]:
+            spans[-1] = (spans[-1][0], max(stop, spans[-1][1]))
         else:
-            joined.append((first, stop))
-    return Excerpt(tuple(joined))
+            spans.append((first, stop))
+    return Excerpt(tuple(spans))
 
 
 def _measure_information(trace: Trace, model: Model, floor: Mapping[str, float], changes: Sequence[Mapping[str, float]],
@@ -146,39 +146,39 @@ def _measure_information(trace: Trace, model: Model, floor: Mapping[str, float],
     tolerances = list_tolerance_sizes(model)
     names = list(dict.fromkeys([*tolerances, *(name for change in changes for name in change)]))
     base = np.array([model[name] for name in names])
-    moved = [{name: model[name] + size} for name, size in tolerances.items()] + list(changes)
-    table = np.array([base, *([change.get(n, v) for n, v in zip(names, base, strict=True)] for change in moved)])
+    variants = [{name: model[name] + size} for name, size in tolerances.items()] + list(changes)
+    table = np.array([base, *([change.get(n, v) for n, v in zip(names, base, strict=True)] for change in variants)])
     lanes = Lanes(model, names, INFORMATION_STEPS)
     scale = 1.0 / np.array([floor[name] for name in trace.outputs])
-    information, misfit = np.zeros((count, len(moved), len(moved))), np.zeros(count)
-    measured = np.zeros(count)
+    information, misfit = np.zeros((count, len(variants), len(variants))), np.zeros(count)
+    shares = np.zeros(count)
     turns = replay_in_turns(lanes, limit_dynamic_friction(names, table), trace, trace.anchor, ANCHOR_RATE, rows)
     for k, (first, out) in enumerate(turns):
         if k >= count:
             break
         progress("choosing the part to fit", k / count)
-        seen = trace.measurements[:, first:first + rows]
-        there = ~np.isnan(seen)
-        shown = out.transpose(0, 2, 1)[:, trace.output_columns]
-        shift = np.where(there, (shown[1:] - shown[0]) * scale[:, None], 0.0)
-        shift = np.clip(shift, -LARGEST_SHIFT, LARGEST_SHIFT)[:, :, ::2].reshape(len(moved), -1)
+        measurements = trace.measurements[:, first:first + rows]
+        is_measured = ~np.isnan(measurements)
+        predictions = out.transpose(0, 2, 1)[:, trace.output_columns]
+        shift = np.where(is_measured, (predictions[1:] - predictions[0]) * scale[:, None], 0.0)
+        shift = np.clip(shift, -LARGEST_SHIFT, LARGEST_SHIFT)[:, :, ::2].reshape(len(variants), -1)
         information[k] = shift @ shift.T
-        left = np.where(there, (shown[0] - seen) * scale[:, None], 0.0)
-        misfit[k] = float(np.minimum(left**2, LARGEST_SHIFT**2).sum()) / max(int(there.sum()), 1)
-        measured[k] = there.mean()
-    return information, misfit, measured
+        residuals = np.where(is_measured, (predictions[0] - measurements) * scale[:, None], 0.0)
+        misfit[k] = float(np.minimum(residuals**2, LARGEST_SHIFT**2).sum()) / max(int(is_measured.sum()), 1)
+        shares[k] = is_measured.mean()
+    return information, misfit, shares
 
 
-def _choose_pieces(information: Floats, full: Flags) -> list[int]:
+def _choose_pieces(information: Floats, is_full: Flags) -> list[int]:
     """The pieces that together say most, the first first."""
     alike = 20.0  # neighbouring samples that say the same thing
-    total, chosen = np.eye(information.shape[1]), list[int]()
-    for _ in range(min(PIECES, int(full.sum()))):
-        gains = np.where(full, np.linalg.slogdet(total + information / alike)[1], -np.inf)
-        gains[chosen] = -np.inf
-        chosen.append(int(np.argmax(gains)))
-        total = total + information[chosen[-1]] / alike
-    return chosen
+    total, pieces = np.eye(information.shape[1]), list[int]()
+    for _ in range(min(PIECES, int(is_full.sum()))):
+        gains = np.where(is_full, np.linalg.slogdet(total + information / alike)[1], -np.inf)
+        gains[pieces] = -np.inf
+        pieces.append(int(np.argmax(gains)))
+        total = total + information[pieces[-1]] / alike
+    return pieces
 
 
 def cut_excerpt(trace: Trace, excerpt: Excerpt) -> Trace:
@@ -189,18 +189,18 @@ def cut_excerpt(trace: Trace, excerpt: Excerpt) -> Trace:
     ranges, parts, rows = list[tuple[int, int, int]](), [], 0
     for first, stop in excerpt.pieces:
         begin, stop = max(_find_lead_in(trace, first), ranges[-1][2] if ranges else 0), min(stop, len(trace))
-        known = np.flatnonzero(~np.isnan(trace.controlled[begin:stop]))
-        if not len(known):
+        measured_rows = np.flatnonzero(~np.isnan(trace.controlled[begin:stop]))
+        if not len(measured_rows):
             continue
-        begin += int(known[0])  # a replay starts where the ram was seen
+        begin += int(measured_rows[0])  # a replay starts where the ram was seen
         ranges.append((begin, max(first, begin), stop))
         parts.append(Part(rows, rows + stop - begin, begin - rows))
         rows += stop - begin
-    kept = np.concatenate([np.arange(begin, stop) for begin, _, stop in ranges])
-    leading = np.concatenate([np.arange(begin, stop) < first if begin else np.zeros(stop, bool)
-                              for begin, first, stop in ranges])
-    return trace.take_rows(kept, usable=trace.usable[kept] & ~leading, incomplete=trace.incomplete[kept] | leading,
-                           parts=tuple(parts))
+    places = np.concatenate([np.arange(begin, stop) for begin, _, stop in ranges])
+    is_lead_in = np.concatenate([np.arange(begin, stop) < first if begin else np.zeros(stop, bool)
+                                 for begin, first, stop in ranges])
+    return trace.take_rows(places, usable=trace.usable[places] & ~is_lead_in,
+                           incomplete=trace.incomplete[places] | is_lead_in, parts=tuple(parts))
 
 
 def _find_lead_in(trace: Trace, first: int, wide: float = 0.5, longest: float = 20.0) -> int:
@@ -239,13 +239,13 @@ class Judgement:
 
     def typical_ratio(self, floor: Mapping[str, float], share: float = 0.85) -> dict[str, float]:
         """RMS residual over the floor, without the worst blocks: a stop that is made or missed by a hair is luck."""
-        found = {}
+        ratios = {}
         for name, squares, n in zip(self.outputs, self.blocks, self.count, strict=True):
-            full = n > 0.5 * n.max()
-            means = np.sort(squares[full] / n[full])
-            kept = means[:max(1, round(share * len(means)))]
-            found[name] = float(np.sqrt(kept.mean())) / floor[name] if len(kept) else 0.0
-        return found
+            is_full = n > 0.5 * n.max()
+            means = np.sort(squares[is_full] / n[is_full])
+            typical_means = means[:max(1, round(share * len(means)))]
+            ratios[name] = float(np.sqrt(typical_means.mean())) / floor[name] if len(typical_means) else 0.0
+        return ratios
 
     def find_worst_piece(self, floor: Mapping[str, float], rows: int, apart: Sequence[tuple[int, int]]
                          ) -> tuple[int, int] | None:
@@ -266,18 +266,18 @@ class Judgement:
 def judge_on_all(problem: Problem, fits: Sequence[Fit], trace: Trace, steps: int) -> list[Judgement]:
     """What each fit leaves of a whole recording `trace`, replayed with `steps` a cycle, side by side."""
     names = list(dict.fromkeys(f.name for fit in fits for f in fit.free))
-    found = [dict(zip((f.name for f in fit.free), problem.convert_unknowns(fit.free, fit.x[None])[0], strict=True))
-             for fit in fits]
-    values = np.array([[own.get(name, problem.model[name]) for name in names] for own in found])
+    fit_values = [dict(zip((f.name for f in fit.free), problem.convert_unknowns(fit.free, fit.x[None])[0], strict=True))
+                  for fit in fits]
+    values = np.array([[parameters.get(name, problem.model[name]) for name in names] for parameters in fit_values])
     lanes = Lanes(problem.model, names, steps)
     squares, counts = [], []
     turns = replay_in_turns(lanes, limit_dynamic_friction(names, values), trace, trace.anchor, problem.anchor)
     for first, out in turns:
-        seen = trace.measurements[:, first:first + out.shape[1]]
-        left = np.ascontiguousarray(out.transpose(0, 2, 1)[:, trace.output_columns] - seen)
-        if seen.shape[1] > BLOCK:
-            remove_mains(left, 0, seen.shape[1], trace.period, np.full(len(seen), np.inf))
-        squares.append(sum_blocks(np.nan_to_num(left)))
-        counts.append(sum_blocks((~np.isnan(seen)).astype(float)))
+        measurements = trace.measurements[:, first:first + out.shape[1]]
+        residuals = np.ascontiguousarray(out.transpose(0, 2, 1)[:, trace.output_columns] - measurements)
+        if measurements.shape[1] > BLOCK:
+            remove_mains(residuals, 0, measurements.shape[1], trace.period, np.full(len(measurements), np.inf))
+        squares.append(sum_blocks(np.nan_to_num(residuals)))
+        counts.append(sum_blocks((~np.isnan(measurements)).astype(float)))
     blocks, count = np.concatenate(squares, axis=-1), np.concatenate(counts, axis=-1)
-    return [Judgement(trace.outputs, own, count) for own in blocks]
+    return [Judgement(trace.outputs, sums, count) for sums in blocks]

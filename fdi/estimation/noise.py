@@ -58,8 +58,8 @@ def find_floors(residual: Mapping[str, Floats], repeats: Sequence[Mapping[str, F
 
     Rows correspond; NaN is a missing sample. Signals that no repeat has are left out. Lengths may differ at the end.
     """
-    others = {name: [repeat[name] for repeat in repeats if name in repeat] for name in residual}
-    return {name: floor_from_repeats(residual[name], own, period) for name, own in others.items() if own}
+    signal_repeats = {name: [repeat[name] for repeat in repeats if name in repeat] for name in residual}
+    return {name: floor_from_repeats(residual[name], runs, period) for name, runs in signal_repeats.items() if runs}
 
 
 def floor_from_repeats(residual: Floats, repeats: Sequence[Floats], period: float = 1e-3) -> Floor:
@@ -92,20 +92,20 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
 
     What a replay takes over of the controlled signal's noise is in them: see `compute_anchor_noise`.
     """
-    out = {}
-    taken_over = compute_anchor_noise(trace, model)
+    floors = {}
+    anchor_noise = compute_anchor_noise(trace, model)
     for name in trace.outputs:
-        signal, seen = trace.declared.find(name), floor_from_data(trace.mask_unusable(name))
-        given = (simulate_reading_noise(model, trace.controlled) if signal == trace.declared.controlled else
+        signal, data_floor = trace.declared.find(name), floor_from_data(trace.mask_unusable(name))
+        level = (simulate_reading_noise(model, trace.controlled) if signal == trace.declared.controlled else
                  model.values.get(signal.noise, 0.0))
         share = 1.0
         if name in trace.sensors:
-            given = trace.sensors[name].measure_noise(given)
+            level = trace.sensors[name].measure_noise(level)
             share = trace.sensors[name].count_independent(trace.period)
-        found = Floor(given, "model") if given > 0.0 and seen.value < NOISIER_THAN_MODEL * given else seen
-        value = float(np.hypot(max(found.value, signal.finest), taken_over.get(name, 0.0)))
-        out[name] = found._replace(value=value, freedom=share)
-    return out
+        floor = Floor(level, "model") if level > 0.0 and data_floor.value < NOISIER_THAN_MODEL * level else data_floor
+        value = float(np.hypot(max(floor.value, signal.finest), anchor_noise.get(name, 0.0)))
+        floors[name] = floor._replace(value=value, freedom=share)
+    return floors
 
 
 def find_sensor_level(trace: Trace, signal: Signal, model: Model) -> float:
@@ -133,10 +133,10 @@ def compute_anchor_noise(trace: Trace, model: Model) -> dict[str, float]:
     level = find_sensor_level(trace, controlled, model)
     pull = ANCHOR_RATE * model["controller.period"]
     start, p = model.build_start()[0], model.build_record()[0]
-    shown, moved = kind.measure(start, p), kind.measure(kind.move(start, level, p), p)
-    passed = np.sqrt(pull / (2.0 - pull))
-    return {signal.name: float(abs(after - before) * passed) for signal, before, after
-            in zip(trace.declared.outputs, shown, moved, strict=True) if signal != controlled}
+    outputs, shifted_outputs = kind.measure(start, p), kind.measure(kind.move(start, level, p), p)
+    filter_gain = np.sqrt(pull / (2.0 - pull))
+    return {signal.name: float(abs(after - before) * filter_gain) for signal, before, after
+            in zip(trace.declared.outputs, outputs, shifted_outputs, strict=True) if signal != controlled}
 
 
 def simulate_reading_noise(model: Model, controlled: Floats) -> float:
@@ -184,22 +184,22 @@ def measure_quiet_level(noise: Sequence[Floats], window: int = WINDOW) -> tuple[
         return (float(np.sqrt(np.nanmean(x**2))), 1.0, 1.0) if len(x) and not np.isnan(x).all() else (0.0, 0.0, 1.0)
     power = np.nanmean(pieces**2, axis=1)
     order = np.argsort(power)
-    kept = order[:max(1, round(QUIET * len(order)))]
+    quiet_rows = order[:max(1, round(QUIET * len(order)))]
     level, freedom = float(np.quantile(power, QUIET)), float(window)
     for _ in range(30):
-        freedom = _measure_freedom(pieces[kept])
-        if not len(kept) or level == 0.0:
+        freedom = _measure_freedom(pieces[quiet_rows])
+        if not len(quiet_rows) or level == 0.0:
             break
-        if len(kept) == max(1, round(QUIET * len(order))):
+        if len(quiet_rows) == max(1, round(QUIET * len(order))):
             level = float(np.quantile(power, QUIET)) / _mean_square(QUIET, freedom)
         limit = _mean_square(NOISE_WINDOW_CONFIDENCE, freedom)
-        now = np.flatnonzero(power <= limit * level)
+        new_rows = np.flatnonzero(power <= limit * level)
         # mean of the windows below the limit
         below = float(gammainc(freedom / 2 + 1, freedom * limit / 2)) / NOISE_WINDOW_CONFIDENCE
-        if len(now) == 0 or np.array_equal(now, kept):
+        if len(new_rows) == 0 or np.array_equal(new_rows, quiet_rows):
             break
-        kept, level = now, float(power[now].mean()) / below
-    return float(np.sqrt(level)), len(kept) / len(power), freedom / window
+        quiet_rows, level = new_rows, float(power[new_rows].mean()) / below
+    return float(np.sqrt(level)), len(quiet_rows) / len(power), freedom / window
 
 
 def _mean_square(part: float, freedom: float) -> float:
@@ -251,14 +251,14 @@ def _fit_phasors(x: Floats, rows: Flags, frequencies: Floats, period: float) -> 
     """Amplitude and phase of sines in the chosen windows of x, which are freed of their mean and slope first."""
     t = np.arange(WINDOW) - (WINDOW - 1) / 2
     pieces = _cut_windows(x, WINDOW)
-    chosen = np.flatnonzero(rows[:len(pieces)] & ~np.isnan(pieces).any(axis=1))
-    if not len(chosen):
+    windows = np.flatnonzero(rows[:len(pieces)] & ~np.isnan(pieces).any(axis=1))
+    if not len(windows):
         return np.zeros(len(frequencies), complex)
-    level = pieces[chosen] - pieces[chosen].mean(axis=1, keepdims=True)
+    level = pieces[windows] - pieces[windows].mean(axis=1, keepdims=True)
     level = level - np.outer(np.einsum("ij,j->i", level, t) / np.sum(t**2), t)
     turn = -2j * np.pi * period * frequencies
     inside = np.einsum("ij,jk->ik", level, np.exp(np.outer(np.arange(WINDOW), turn)))
-    out: NDArray[np.complex128] = 2.0 / WINDOW * (inside * np.exp(np.outer(chosen * WINDOW, turn))).mean(axis=0)
+    out: NDArray[np.complex128] = 2.0 / WINDOW * (inside * np.exp(np.outer(windows * WINDOW, turn))).mean(axis=0)
     return out
 
 
@@ -306,9 +306,9 @@ def filter_signal(x: Floats, signal: int, weights: Floats, out: Floats) -> None:
             sums[:] = 0.0
             for i in range(len(weights)):
                 begin = max(i - first, 0)
-                there = x[run, signal, first + begin - i:n]
+                samples = x[run, signal, first + begin - i:n]
                 for t in range(len(sums) - begin):
-                    sums[begin + t] += weights[i] * there[t]
+                    sums[begin + t] += weights[i] * samples[t]
             for t in range(len(sums)):
                 sums[t] = sums[t] if sums[t] == sums[t] else 0.0
 
@@ -323,9 +323,9 @@ def measure_level(difference: Floats, block: int = WINDOW) -> float:
     blocks = _cut_windows(difference, block)
     if not len(blocks):
         return float(np.nanstd(difference))
-    known = ~np.isnan(blocks)
+    has_value = ~np.isnan(blocks)
     with np.errstate(invalid="ignore", divide="ignore"):  # a block may have no value at all
-        variance = np.nansum(blocks**2, axis=1) / known.sum(axis=1)
+        variance = np.nansum(blocks**2, axis=1) / has_value.sum(axis=1)
     mean_over_median = 1.0 / 0.993  # mean over median of the variance of BLOCK normal samples
     return float(np.sqrt(np.nanmedian(variance) * mean_over_median))
 

@@ -83,18 +83,18 @@ def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor
 
 def measure_misfit(trace: Trace, model: Model) -> float:
     """How badly a replay fits the outputs of a prepared trace: the mean logarithm of their RMS residuals."""
-    left = compute_residuals(trace, replay_current(trace, model, 20))
-    return sum(math.log(rms(r)) for r in left.values()) / len(left)
+    residuals = compute_residuals(trace, replay_current(trace, model, 20))
+    return sum(math.log(rms(r)) for r in residuals.values()) / len(residuals)
 
 
 def replay_with_checked_steps(trace: Trace, model: Model, floor: Mapping[str, float]) -> Replay:
     """The replay from the current, with the step that the floor of each signal (SI units) asks for."""
     coarse, undecided, blind = _replay_with_other_frictions(trace, model, floor)
-    checked = trace
+    part = trace
     if is_long(trace):
-        checked = cut_excerpt(trace, choose_excerpt(trace, silence_sensors(model), floor))
-    steps, error = _choose_steps(checked, model, floor, undecided if checked is trace else ~checked.usable)
-    if steps > (REPLAY_STEPS if checked is trace else 2 * REPLAY_STEPS):  # else the replay that is there will do
+        part = cut_excerpt(trace, choose_excerpt(trace, silence_sensors(model), floor))
+    steps, error = _choose_steps(part, model, floor, undecided if part is trace else ~part.usable)
+    if steps > (REPLAY_STEPS if part is trace else 2 * REPLAY_STEPS):  # else the replay that is there will do
         coarse = replay_current(trace, model, steps)
     else:
         steps = REPLAY_STEPS
@@ -119,23 +119,24 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
     turns += [replay_in_turns(lanes, values[:1], trace, trace.anchor + shift, ANCHOR_RATE)
               for noise in guess_anchor_noise(trace, model, floor) for shift in (noise, -noise)]
     outputs = trace.declared.outputs
-    found = np.empty((len(outputs), len(trace)))
+    columns = np.empty((len(outputs), len(trace)))
     undecided = np.zeros(len(trace), bool)
     power, count = np.zeros(len(outputs)), 0
-    for (first, own), *others in zip(*turns, strict=True):
-        rows = slice(first, first + own.shape[1])
-        found[:, rows] = own[0].T
-        moved = [other - own[:1] for _, other in others]
-        changes = np.concatenate([compare_neighbours(names, own), *moved])
+    for (first, runs), *other_turns in zip(*turns, strict=True):
+        rows = slice(first, first + runs.shape[1])
+        columns[:, rows] = runs[0].T
+        input_changes = [other - runs[:1] for _, other in other_turns]
+        changes = np.concatenate([compare_neighbours(names, runs), *input_changes])
         for i, signal in enumerate(outputs):
             if signal.name in floor:
-                power_moved = measure_window_power(changes[:, :, i]).max(axis=0, initial=0.0)
-                undecided[rows] |= ((power_moved > max(floor[signal.name], signal.slight) ** 2)
+                change_power = measure_window_power(changes[:, :, i]).max(axis=0, initial=0.0)
+                undecided[rows] |= ((change_power > max(floor[signal.name], signal.slight) ** 2)
                                     & ~np.isnan(trace.mask_unusable(signal.name)[rows]))
-        guessed = np.concatenate([own[:0], *moved[:len(currents)]])[:, ~undecided[rows]]
-        power, count = power + (guessed**2).sum(axis=(0, 1)), count + guessed.shape[0] * guessed.shape[1]
+        current_changes = np.concatenate([runs[:0], *input_changes[:len(currents)]])[:, ~undecided[rows]]
+        power, count = (power + (current_changes**2).sum(axis=(0, 1)),
+                        count + current_changes.shape[0] * current_changes.shape[1])
     blind = {name: math.sqrt(float(power[i]) / count) if count else 0.0 for i, name in enumerate(trace.output_names)}
-    return {name: found[i] for i, name in enumerate(trace.output_names)}, undecided, blind
+    return {name: columns[i] for i, name in enumerate(trace.output_names)}, undecided, blind
 
 
 def _choose_steps(trace: Trace, model: Model, floor: Mapping[str, float], undecided: Flags
@@ -161,13 +162,13 @@ def guess_current(trace: Trace) -> list[Floats]:
     if not trace.filled.any():
         return []
     odd = np.flatnonzero(~trace.filled)[1::2]
-    thinned = trace.drive.copy()
-    thinned[trace.filled], thinned[odd] = np.nan, np.nan
-    again, lost = bridge_gaps(thinned, len(trace))
-    error = np.where(lost, 0.0, trace.drive - again)
-    near = odd[np.clip(np.searchsorted(odd, np.arange(len(trace))), 0, len(odd) - 1)]
+    sparse_drive = trace.drive.copy()
+    sparse_drive[trace.filled], sparse_drive[odd] = np.nan, np.nan
+    fill, is_unknown = bridge_gaps(sparse_drive, len(trace))
+    error = np.where(is_unknown, 0.0, trace.drive - fill)
+    nearest = odd[np.clip(np.searchsorted(odd, np.arange(len(trace))), 0, len(odd) - 1)]
     signs = np.random.default_rng(0).choice([-1.0, 1.0], len(trace))
-    return [trace.drive + np.where(trace.filled, sign * signs * error[near], 0.0) for sign in (1.0, -1.0)]
+    return [trace.drive + np.where(trace.filled, sign * signs * error[nearest], 0.0) for sign in (1.0, -1.0)]
 
 
 def guess_anchor_noise(trace: Trace, model: Model, floor: Mapping[str, float]) -> list[Floats]:
@@ -209,10 +210,10 @@ def compare_neighbours(names: Sequence[str], runs: Floats) -> Floats:
     What another parameter changes smoothly is nothing undecided: it is the same both ways, and taken out. A quarter of
     the rest is left, which no rounding of the readings makes as large as their noise.
     """
-    replayed, higher, lower = np.split(runs, [1, 1 + len(runs) // 2])
+    base, higher, lower = np.split(runs, [1, 1 + len(runs) // 2])
     if any(map(is_friction, names)):
-        return np.concatenate([higher, lower]) - replayed
-    return 0.25 * (higher + lower - 2.0 * replayed)
+        return np.concatenate([higher, lower]) - base
+    return 0.25 * (higher + lower - 2.0 * base)
 
 
 def measure_window_power(x: Floats, window: int = WINDOW) -> Floats:
@@ -238,18 +239,19 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
     """
     values = {**problem.model.values, **fit.values}
     names = list(dict.fromkeys([*(f.name for f in fit.free), *filter(is_friction, values)]))
-    tried = vary_frictions(names, values)
-    runs = problem.predict_outputs(names, tried)
+    variants = vary_frictions(names, values)
+    runs = problem.predict_outputs(names, variants)
     changes = [compare_neighbours(names, runs)]
     name = problem.trace.declared.controlled.name
     for sign in (1.0, -1.0):
-        noisy = [run.with_columns({name: run.controlled + sign * noise}) for run in (problem.trace, *problem.also)
-                 for noise in guess_anchor_noise(run, problem.model, floor)]
-        if noisy:
-            shifted = replace(problem, trace=noisy[0], also=tuple(noisy[1:]))
-            changes.append(shifted.predict_outputs(names, tried[:1]) - runs[:1])
-    moved = np.concatenate(changes)
-    power = measure_window_power(moved.reshape(-1, moved.shape[2])).reshape(moved.shape)
+        noisy_traces = [run.with_columns({name: run.controlled + sign * noise})
+                        for run in (problem.trace, *problem.also)
+                        for noise in guess_anchor_noise(run, problem.model, floor)]
+        if noisy_traces:
+            noisy_problem = replace(problem, trace=noisy_traces[0], also=tuple(noisy_traces[1:]))
+            changes.append(noisy_problem.predict_outputs(names, variants[:1]) - runs[:1])
+    all_changes = np.concatenate(changes)
+    power = measure_window_power(all_changes.reshape(-1, all_changes.shape[2])).reshape(all_changes.shape)
     least = np.array([[max(floor[s], problem.trace.declared.find(s).slight)] for s in problem.trace.outputs])
     is_large = power.max(axis=0, initial=0.0) > least**2
     undecided: Flags = (is_large & ~np.isnan(problem.trace.measurements)).any(axis=0)
@@ -285,12 +287,12 @@ def leave_out_rest(trace: Trace, model: Model, memory: float = MEMORY) -> Trace:
     if model.kind.correct is None:
         return trace
     noise = find_sensor_level(trace, trace.declared.controlled, model)
-    moving = trace.usable & ~find_rest_rows(trace.controlled, trace.period, noise, memory=memory)
-    rests = float((trace.usable & ~moving).sum()) * trace.period
-    if rests == 0.0 or moving.sum() < FEWEST_ROWS:
+    is_moving = trace.usable & ~find_rest_rows(trace.controlled, trace.period, noise, memory=memory)
+    rest_time = float((trace.usable & ~is_moving).sum()) * trace.period
+    if rest_time == 0.0 or is_moving.sum() < FEWEST_ROWS:
         return trace
-    return trace.with_columns({}, usable=moving).with_notes(
-        f"{rests:.1f} s at rest are not compared: friction has any value there")
+    return trace.with_columns({}, usable=is_moving).with_notes(
+        f"{rest_time:.1f} s at rest are not compared: friction has any value there")
 
 
 def leave_out_rows(trace: Trace, rows: Flags) -> Trace:
@@ -298,9 +300,9 @@ def leave_out_rows(trace: Trace, rows: Flags) -> Trace:
 
     As it is where there are none to leave out, or where more than `HELD_OUT_UNDECIDED_SHARE` would be.
     """
-    kept = trace.usable & ~rows
-    share = float(kept.sum() / trace.usable.sum())
-    return trace if share == 1.0 or share < 1.0 - HELD_OUT_UNDECIDED_SHARE else trace.with_columns({}, usable=kept)
+    usable = trace.usable & ~rows
+    share = float(usable.sum() / trace.usable.sum())
+    return trace if share == 1.0 or share < 1.0 - HELD_OUT_UNDECIDED_SHARE else trace.with_columns({}, usable=usable)
 
 
 def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) -> Flags:
@@ -309,19 +311,19 @@ def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, floa
     A replay that has missed a stop goes on beside the measurement, as its neighbours do, so these do not show it.
     None where more than `HELD_OUT_UNDECIDED_SHARE` of the run hangs on stops, or half of it is not near noise.
     """
-    names, left = problem.trace.outputs, fit.residuals[:, :len(problem.trace)]
+    names, residuals = problem.trace.outputs, fit.residuals[:, :len(problem.trace)]
     levels = np.array([[floor[s]] for s in names])
-    none = np.zeros(left.shape[1], bool)
-    if (compute_typical_rms(left[:, problem.trace.usable], 0.5) > NEAR_NOISE * levels[:, 0]).any():
-        return none
+    no_rows = np.zeros(residuals.shape[1], bool)
+    if (compute_typical_rms(residuals[:, problem.trace.usable], 0.5) > NEAR_NOISE * levels[:, 0]).any():
+        return no_rows
     alone, reach = replace(problem, also=()), None
     undecided = find_undecided_rows(alone, fit, floor) | ~problem.trace.usable
     if problem.model.kind.correct is not None and any(map(is_friction, problem.model.values)):
         values = {name: x for name, x in problem.model.values.items() if is_friction(name)} | fit.values
         rows = np.array([[x * keep if is_friction(n) else x for n, x in values.items()] for keep in (1.0, 0.0)])
         reach = np.diff(alone.predict_outputs(list(values), rows), axis=0)[0] / levels
-    undecided = extend_until_noise(undecided, left / levels, reach)
-    return undecided if undecided.mean() <= HELD_OUT_UNDECIDED_SHARE else none
+    undecided = extend_until_noise(undecided, residuals / levels, reach)
+    return undecided if undecided.mean() <= HELD_OUT_UNDECIDED_SHARE else no_rows
 
 
 def extend_until_noise(undecided: Flags, ratios: Floats, reach: Floats | None = None) -> Flags:
@@ -345,41 +347,41 @@ def measure_decided_errors(problem: Problem, fit: Fit, floor: Mapping[str, float
 
     A repeat stops elsewhere, so it tells a stop that was missed from physics; without one, only this does.
     """
-    names, left = problem.trace.outputs, fit.residuals[:, :len(problem.trace)]
-    errors = dict(zip(names, map(rms, left), strict=True))
+    names, residuals = problem.trace.outputs, fit.residuals[:, :len(problem.trace)]
+    errors = dict(zip(names, map(rms, residuals), strict=True))
     if any(errors[s] > RESIDUAL_IS_NOISE * floor[s] for s in names):
         undecided = find_unpredictable_rows(problem, fit, floor)
         if undecided.any():
-            kept = left[:, ~undecided & problem.trace.usable]
-            return dict(zip(names, compute_typical_rms(kept).tolist(), strict=True))
+            decided_residuals = residuals[:, ~undecided & problem.trace.usable]
+            return dict(zip(names, compute_typical_rms(decided_residuals).tolist(), strict=True))
     return errors
 
 
 def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tuple[float, float]:
     """Of a replay without anchor: RMS of the residual of the controlled signal, SI, and its rate of departure, SI/s."""
     name = trace.declared.controlled.name
-    begun, rate = trace, 0.0
+    run, rate = trace, 0.0
     if not trace.usable[0]:  # in motion: drawn to the measured one until it is judged
-        known = np.arange(len(trace)) <= int(np.argmax(trace.usable))
-        begun, rate = trace.with_columns({name: np.where(known, trace.unlagged, np.nan)}), ANCHOR_RATE
-    free = trace.mask_unusable(name) - replay_current(begun, model, steps, rate)[name]
-    there = ~np.isnan(free)
-    t = trace.t[there] - trace.t[there].mean()
-    return rms(free), float(np.sum(t * free[there]) / np.sum(t**2))
+        is_anchored = np.arange(len(trace)) <= int(np.argmax(trace.usable))
+        run, rate = trace.with_columns({name: np.where(is_anchored, trace.unlagged, np.nan)}), ANCHOR_RATE
+    residual = trace.mask_unusable(name) - replay_current(run, model, steps, rate)[name]
+    is_measured = ~np.isnan(residual)
+    t = trace.t[is_measured] - trace.t[is_measured].mean()
+    return rms(residual), float(np.sum(t * residual[is_measured]) / np.sum(t**2))
 
 
 def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Columns:
     """Residuals, measured less model, of the chosen signals and the drive in a run from the command alone, no noise."""
     rest_time = 1.0  # s at the first demand, before a closed-loop replay begins
-    before = round(rest_time / trace.period)
-    command, load = (np.pad(x, (before, 0), "edge") for x in (trace.command, trace.load))
+    rest_rows = round(rest_time / trace.period)
+    command, load = (np.pad(x, (rest_rows, 0), "edge") for x in (trace.command, trace.load))
     lanes = Lanes(silence_sensors(model), (), steps)
     out = lanes.closed_loop(np.empty((1, 0)), command, load)[0]
     drive = trace.declared.drive.name
     place = trace.declared.columns.index(trace.declared.drive)
-    shown = trace.pass_sensors(np.delete(out, place, axis=-1))[before:]
-    whole = {name: shown[:, i] for i, name in enumerate(trace.output_names)} | {drive: out[before:, place]}
-    return {name: trace.mask_unusable(name) - whole[name] for name in (*trace.outputs, drive)}
+    outputs = trace.pass_sensors(np.delete(out, place, axis=-1))[rest_rows:]
+    columns = {name: outputs[:, i] for i, name in enumerate(trace.output_names)} | {drive: out[rest_rows:, place]}
+    return {name: trace.mask_unusable(name) - columns[name] for name in (*trace.outputs, drive)}
 
 
 def answer_readings(model: Model, trace: Trace, command: Floats, controlled: Floats) -> Floats:
@@ -387,9 +389,9 @@ def answer_readings(model: Model, trace: Trace, command: Floats, controlled: Flo
 
     The other readings are those of the trace; NaN where the law needs one that was not measured.
     """
-    others = [trace.column(name) for name in trace.output_names[1:]]
+    other_readings = [trace.column(name) for name in trace.output_names[1:]]
     low, high = (_answer_from_the_middle(model, trace, command, np.column_stack(
-        [controlled, *(np.full(len(x), guess) if np.isnan(x).all() else hold_last(x) for x in others)]))
+        [controlled, *(np.full(len(x), guess) if np.isnan(x).all() else hold_last(x) for x in other_readings)]))
         for guess in (-1e9, 1e9))  # so far apart that a limit of the drive does not make them alike
     return np.where(low == high, low, np.nan)
 
@@ -423,17 +425,17 @@ def find_controller_gain(model: Model, period: float) -> tuple[float, float]:
     if "controller.proportional_gain" in model.values:
         return abs(model["controller.proportional_gain"]), abs(model["controller.derivative_gain"]) / period
     size = 1e-6 * (model.kind.signals.command.largest if math.isfinite(model.kind.signals.command.largest) else 1.0)
-    sensed = np.zeros((50, len(model.kind.signals.outputs)))
-    sensed[20:, 0] = size
-    answers = compute_answers(model, np.zeros(50), sensed)
+    readings = np.zeros((50, len(model.kind.signals.outputs)))
+    readings[20:, 0] = size
+    answers = compute_answers(model, np.zeros(50), readings)
     steady = abs(float(answers[21] - answers[19])) / size
     return steady, max(abs(float(answers[20] - answers[19])) / size - steady, 0.0)
 
 
 def has_controller_memory(model: Model) -> bool:
     """Whether the controller's answer may hang on readings of long ago: by an integral, or in a way not known."""
-    unknown = getattr(model.kind, "control_memory", None) is not None
-    return model.values.get("controller.integral_gain", float(unknown)) != 0.0
+    is_unknown = getattr(model.kind, "control_memory", None) is not None
+    return model.values.get("controller.integral_gain", float(is_unknown)) != 0.0
 
 
 def differentiate(x: Floats, size: int, order: int) -> Floats:
@@ -454,45 +456,45 @@ class Scatter(NamedTuple):
 
 def fit_scatter(trace: Trace, model: Model, floor: Mapping[str, float]) -> Scatter:
     """Refit the tolerances to a trace; `floor` of each chosen signal in its SI unit."""
-    known = list_tolerance_sizes(model)
-    base = np.array([model[name] for name in known])
-    size = np.array(list(known.values()))
+    tolerances = list_tolerance_sizes(model)
+    base = np.array([model[name] for name in tolerances])
+    size = np.array(list(tolerances.values()))
     scatter_steps = 20  # a cycle; coarse, because only the size of the residual matters here
-    lanes = Lanes(silence_sensors(model), list(known), scatter_steps)
+    lanes = Lanes(silence_sensors(model), list(tolerances), scatter_steps)
     scale = np.array([floor[name] for name in trace.outputs])[:, None]
 
     def compute_scaled_residuals(x: Floats) -> Floats:
         """Residuals (m, signals * n) in floors, for changes x (m, parameters) in tolerances."""
-        values = limit_dynamic_friction(list(known), base + x * size)
+        values = limit_dynamic_friction(list(tolerances), base + x * size)
         out = replay_lanes(lanes, values, trace).transpose(0, 2, 1)[:, trace.output_columns]
-        left: Floats = np.nan_to_num((trace.measurements - out) / scale)
-        return left.reshape(len(x), -1)
+        residuals: Floats = np.nan_to_num((trace.measurements - out) / scale)
+        return residuals.reshape(len(x), -1)
 
     whole = trace
     if is_long(whole):
         trace = cut_excerpt(whole, choose_excerpt(whole, silence_sensors(model), floor))
     x = np.zeros(len(base))
-    now = compute_scaled_residuals(x[None])[0]
+    residual = compute_scaled_residuals(x[None])[0]
     for _ in range(2):
-        slope = (compute_scaled_residuals(x + SCATTER_DIFFERENCE * np.eye(len(base))) - now) / SCATTER_DIFFERENCE
-        weight = 1.0 / np.sqrt(1.0 + (now / SCATTER_LARGE_RESIDUAL) ** 2)
+        slope = (compute_scaled_residuals(x + SCATTER_DIFFERENCE * np.eye(len(base))) - residual) / SCATTER_DIFFERENCE
+        weight = 1.0 / np.sqrt(1.0 + (residual / SCATTER_LARGE_RESIDUAL) ** 2)
         normal = np.einsum("ik,jk,k->ij", slope, slope, weight, optimize=False) / ALIKE + np.eye(len(base))
-        step = np.linalg.solve(normal, -np.einsum("ik,k->i", slope, weight * now) / ALIKE - x)
-        tried = np.clip(x + np.array([1.0, 0.5, 0.2])[:, None] * step, -SCATTER_TOLERANCES, SCATTER_TOLERANCES)
-        found = compute_scaled_residuals(tried)
+        step = np.linalg.solve(normal, -np.einsum("ik,k->i", slope, weight * residual) / ALIKE - x)
+        trials = np.clip(x + np.array([1.0, 0.5, 0.2])[:, None] * step, -SCATTER_TOLERANCES, SCATTER_TOLERANCES)
+        trial_residuals = compute_scaled_residuals(trials)
         large = SCATTER_LARGE_RESIDUAL
-        costs = 2 * large**2 * (np.sqrt(1 + (found / large) ** 2) - 1).sum(axis=1) / ALIKE
-        best = int(np.argmin(costs + (tried**2).sum(axis=1)))
-        x, now = tried[best], found[best]
+        costs = 2 * large**2 * (np.sqrt(1 + (trial_residuals / large) ** 2) - 1).sum(axis=1) / ALIKE
+        best = int(np.argmin(costs + (trials**2).sum(axis=1)))
+        x, residual = trials[best], trial_residuals[best]
     if whole is not trace:
         trace = whole
-        now = compute_scaled_residuals(x[None])[0]
-    rows = now.reshape(len(scale), -1)
+        residual = compute_scaled_residuals(x[None])[0]
+    rows = residual.reshape(len(scale), -1)
     ratio = {name: rms(np.where(np.isnan(y), np.nan, r))
              for name, r, y in zip(trace.outputs, rows, trace.measurements, strict=True)}
     error = {name: ratio[name] * floor[name] for name in ratio}
-    moved = dict(sorted(zip(known, x.tolist(), strict=True), key=lambda item: -abs(item[1])))
-    return Scatter(error, ratio, moved, max(ratio.values()) < RESIDUAL_IS_SCATTER)
+    changes = dict(sorted(zip(tolerances, x.tolist(), strict=True), key=lambda item: -abs(item[1])))
+    return Scatter(error, ratio, changes, max(ratio.values()) < RESIDUAL_IS_SCATTER)
 
 
 FEWEST_ROWS = 200  # of a recording; fewer cannot tell anything
@@ -564,8 +566,8 @@ def match_period(model: Model, trace: Trace, tolerance: float = 0.0) -> Model:
     Raises:
         InputError: a period that no controller has.
     """
-    own = model["controller.period"]
-    if own == trace.period or abs(own / trace.period - 1.0) < tolerance:
+    model_period = model["controller.period"]
+    if model_period == trace.period or abs(model_period / trace.period - 1.0) < tolerance:
         return model
     shortest, longest = PERIODS
     require(shortest <= trace.period <= longest, "trace", "t", f"one row a controller cycle, {1e3 * shortest:g} to "
@@ -582,11 +584,11 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
     Raises:
         InputError: a recording that cannot be replayed.
     """
-    chosen = _choose_outputs(trace, outputs, source)
-    _check_signals(trace, model, chosen, source)
+    outputs = _choose_outputs(trace, outputs, source)
+    _check_signals(trace, model, outputs, source)
     if trace.declared.names != EHA.names:  # an EHA, which has followed its drive for hundreds of rows, begins with main
         trace = trace.join_lead()
-    rows = _take_rows(trace, chosen)
+    rows = _take_rows(trace, outputs)
     ratio = trace.period / model["controller.period"]
     rows_in_cycle, cycles_in_row = round(1 / ratio), round(ratio)
     ms = 1e3 * trace.period
@@ -595,13 +597,13 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
     if rows_in_cycle > 1 and abs(1 / ratio / rows_in_cycle - 1) < SAME_PERIOD:
         phase = _find_new_current(rows.drive, rows_in_cycle)
         if phase is not None:
-            thinned = _thin_rows(rows, rows_in_cycle, phase)
-            require(len(thinned) >= FEWEST_ROWS, source, "t", f"at least {FEWEST_ROWS} cycles, not {len(thinned)}")
-            for name in (trace.declared.controlled.name, *chosen):
-                require(not np.isnan(thinned.column(name)).all(), source, name, "readings in the rows in which "
+            cycles = _thin_rows(rows, rows_in_cycle, phase)
+            require(len(cycles) >= FEWEST_ROWS, source, "t", f"at least {FEWEST_ROWS} cycles, not {len(cycles)}")
+            for name in (trace.declared.controlled.name, *outputs):
+                require(not np.isnan(cycles.column(name)).all(), source, name, "readings in the rows in which "
                         f"{trace.declared.drive.symbol} is new, every {rows_in_cycle}; there are none")
             note = f"rows every {ms:g} ms, current new every {rows_in_cycle}: one row a cycle is used"
-            return [_fill_inputs(thinned.with_notes(note), trace, source)]
+            return [_fill_inputs(cycles.with_notes(note), trace, source)]
     ways = [rows.with_notes(f"the model's cycle of {1e3 * model['controller.period']:g} ms is taken as the trace's, "
                             f"{ms:g} ms")]
     if 1 < cycles_in_row <= 20 and abs(ratio / cycles_in_row - 1) < SAME_PERIOD:
@@ -616,21 +618,21 @@ def _choose_outputs(trace: Trace, outputs: Sequence[str] | None, source: object)
         require(name in trace.signals, source, name, "a measured column: a replay starts from "
                 f"{declared.drive.symbol}, {declared.command.symbol} and {declared.controlled.symbol}")
     require(len(trace) >= FEWEST_ROWS, source, "t", f"at least {FEWEST_ROWS} rows, not {len(trace)}")
-    measured = [name for name in trace.output_names if name in trace.signals]
+    measured_names = [name for name in trace.output_names if name in trace.signals]
     for name in outputs or ():
         require(name in trace.output_names, "--signals", name, f"some of {','.join(trace.output_names)}")
-        require(name in measured, source, name, f"a measured signal; this trace has {', '.join(measured)}")
-    return tuple(name for name in measured if not outputs or name in outputs)
+        require(name in measured_names, source, name, f"a measured signal; this trace has {', '.join(measured_names)}")
+    return tuple(name for name in measured_names if not outputs or name in outputs)
 
 
-def _check_signals(trace: Trace, model: Model, chosen: Sequence[str], source: object) -> None:
+def _check_signals(trace: Trace, model: Model, outputs: Sequence[str], source: object) -> None:
     """Refuse another plant's recordings, other units and dead sensors."""
     declared = trace.declared
-    recorded = trace.provenance.get("plant", "")
-    own = (f"{recorded}, whose rig recorded this" if recorded else
-           f"a plant with the signals {', '.join(declared.names)}")
-    require((recorded not in MODULES or recorded == model.plant)
-            and declared.names == model.kind.signals.names, source, "--model", f"{own}, not {model.plant}")
+    plant = trace.provenance.get("plant", "")
+    phrase = (f"{plant}, whose rig recorded this" if plant else
+              f"a plant with the signals {', '.join(declared.names)}")
+    require((plant not in MODULES or plant == model.plant)
+            and declared.names == model.kind.signals.names, source, "--model", f"{phrase}, not {model.plant}")
     require(trace.period <= 50 * model["controller.period"], source, "t",
             f"times in s, one row a cycle; the rows are {trace.period:g} s apart")
     for signal in declared[1:]:
@@ -642,24 +644,25 @@ def _check_signals(trace: Trace, model: Model, chosen: Sequence[str], source: ob
                 f"the plant declares {signal.largest:g} as the largest; here it is {largest:g}")
     moves = float(np.nanmax(trace.command) - np.nanmin(trace.command)) > STILL * trace.scale
     drive, controlled = declared.drive.name, declared.controlled.name
-    for name in (drive, *chosen):
+    for name in (drive, *outputs):
         values, signal = trace.column(name), declared.find(name)
         lowest, highest = float(np.nanmin(values)), float(np.nanmax(values))
         if lowest == highest and (moves or name == controlled):
-            without = ",".join(other for other in chosen if other != name) or controlled
+            without = ",".join(other for other in outputs if other != name) or controlled
             hint = "" if name in (drive, controlled) else f" (--signals {without} leaves it out)"
             raise InputError(source, name, f"a signal that changes; it is {lowest:g} throughout{hint}")
         require(not moves or highest - lowest >= signal.faint, source, name,
                 f"values in {signal.unit}; the largest is {highest:g}")
-    known = ~np.isnan(trace.command + trace.controlled)
-    if moves and declared.command.unit == declared.controlled.unit and known.sum() > 1:
-        (power, shared), (_, answer) = np.cov(trace.command[known], trace.controlled[known])
-        require(shared**2 <= ALIKE_SHARE * power * answer or FOLLOWED[0] * power < abs(shared) < FOLLOWED[1] * power,
-                source, controlled, f"values in {declared.controlled.unit}; it moves {shared / power:.3g} times as far "
-                f"as {declared.command.name}")
+    is_known = ~np.isnan(trace.command + trace.controlled)
+    if moves and declared.command.unit == declared.controlled.unit and is_known.sum() > 1:
+        (power, covariance), (_, answer) = np.cov(trace.command[is_known], trace.controlled[is_known])
+        require(covariance**2 <= ALIKE_SHARE * power * answer
+                or FOLLOWED[0] * power < abs(covariance) < FOLLOWED[1] * power, source, controlled,
+                f"values in {declared.controlled.unit}; it moves {covariance / power:.3g} times as far as "
+                f"{declared.command.name}")
 
 
-def _take_rows(trace: Trace, chosen: Sequence[str]) -> Trace:
+def _take_rows(trace: Trace, outputs: Sequence[str]) -> Trace:
     """The recording row by row, nothing filled yet; of the outputs only those chosen, and the controlled one."""
     grid = trace.t[0] + trace.period * np.arange(len(trace))
     jitter = float(np.abs(trace.t - grid).max())
@@ -668,9 +671,9 @@ def _take_rows(trace: Trace, chosen: Sequence[str]) -> Trace:
             f"times are up to {1e3 * jitter:.2g} ms off an even grid; each row is taken as one cycle")
     nothing = np.full(len(trace), np.nan)
     # the controller's block and the anchor of a replay need the controlled signal, chosen or not
-    left_out = {name: nothing for name in trace.output_names[1:] if name not in chosen}
-    return trace.with_columns(left_out, filled=np.zeros(len(trace), bool), incomplete=_find_incomplete(trace),
-                              outputs=tuple(chosen))
+    unused_columns = {name: nothing for name in trace.output_names[1:] if name not in outputs}
+    return trace.with_columns(unused_columns, filled=np.zeros(len(trace), bool), incomplete=_find_incomplete(trace),
+                              outputs=tuple(outputs))
 
 
 def _find_incomplete(trace: Trace) -> Flags:
@@ -691,8 +694,8 @@ def _find_new_current(cor: Floats, rows: int) -> int | None:
 
 def _thin_rows(trace: Trace, rows: int, phase: int) -> Trace:
     """Every so many rows, from row `phase` on."""
-    kept = slice(phase, None, rows)
-    return trace.take_rows(kept, incomplete=np.isnan(trace.controlled[kept]), period=trace.period * rows)
+    selection = slice(phase, None, rows)
+    return trace.take_rows(selection, incomplete=np.isnan(trace.controlled[selection]), period=trace.period * rows)
 
 
 def _spread_rows(trace: Trace, cycles: int) -> Trace:
@@ -718,35 +721,35 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
         recovery: s after a gap, until an anchored replay is back on the recording.
         abrupt: share of the largest current; a gap across which the current changes by more cannot be filled.
     """
-    drive, unknown = bridge_gaps(rows.drive, max(BRIDGED_ROWS, round(trace.period / rows.period)))
-    missing = np.isnan(rows.drive)
+    drive, is_unknown = bridge_gaps(rows.drive, max(BRIDGED_ROWS, round(trace.period / rows.period)))
+    is_missing = np.isnan(rows.drive)
     change = np.abs(hold_next(rows.drive) - hold_last(rows.drive))
-    unknown |= missing & (change > abrupt * np.nanmax(np.abs(rows.drive)))
-    usable = rows.usable & ~extend_flags(unknown, max(round(recovery / rows.period) - 1, 0))
+    is_unknown |= is_missing & (change > abrupt * np.nanmax(np.abs(rows.drive)))
+    usable = rows.usable & ~extend_flags(is_unknown, max(round(recovery / rows.period) - 1, 0))
     notes = []
-    lost = int(np.isnan(trace.drive).sum())
-    if lost:
-        notes.append(f"the current is missing in {lost} of {len(trace)} rows; "
+    missing_rows = int(np.isnan(trace.drive).sum())
+    if missing_rows:
+        notes.append(f"the current is missing in {missing_rows} of {len(trace)} rows; "
                      f"{(~usable).sum() * rows.period:.2g} s of the trace could not be replayed")
     for name in rows.outputs:
         mover = rows.command if name == rows.declared.controlled.name else rows.controlled
-        frozen = _find_frozen(rows.column(name), mover, rows.scale)
-        if frozen.any():
-            first = float(rows.t[int(np.argmax(frozen))])
-            seconds = float(frozen.sum()) * rows.period
+        is_frozen = _find_frozen(rows.column(name), mover, rows.scale)
+        if is_frozen.any():
+            first = float(rows.t[int(np.argmax(is_frozen))])
+            seconds = float(is_frozen.sum()) * rows.period
             notes.append(f"{name} is frozen for {seconds:.2f} s, first at {first:.2f} s: left out there")
-            usable &= ~frozen
+            usable &= ~is_frozen
     d, start = rows.declared, round(recovery / rows.period)
-    works = (abs(float(drive[:10].mean())) > abrupt * float(np.abs(drive).max())
-             and usable[start:].sum() >= FEWEST_ROWS)  # a short recording at rest may have such a drive as well
-    if works or _starts_in_motion(rows):  # a replay begins at rest, without drive
-        what = f"{d.drive.phrase} is at work" if works else f"{d.controlled.phrase} already moves"
+    is_at_work = (abs(float(drive[:10].mean())) > abrupt * float(np.abs(drive).max())
+                  and usable[start:].sum() >= FEWEST_ROWS)  # a short recording at rest may have such a drive as well
+    if is_at_work or _starts_in_motion(rows):  # a replay begins at rest, without drive
+        what = f"{d.drive.phrase} is at work" if is_at_work else f"{d.controlled.phrase} already moves"
         notes.append(f"the {what} in the first row: the first {start * rows.period:g} s are not judged")
         usable[:start] = False
     require(usable.sum() >= FEWEST_ROWS, source, rows.declared.drive.name,
             f"at least {FEWEST_ROWS} rows that can be replayed, not {int(usable.sum())}")
     return rows.with_inputs(_fill_demand(rows.command, 2e-4 * rows.scale), drive, hold_last(rows.load),
-                            usable=usable, filled=missing, notes=(*rows.notes, *notes), slack=_find_slack(trace))
+                            usable=usable, filled=is_missing, notes=(*rows.notes, *notes), slack=_find_slack(trace))
 
 
 def _find_slack(trace: Trace) -> float:
@@ -761,13 +764,13 @@ def _fill_demand(com: Floats, step: float) -> Floats:
     return np.where(np.isnan(com) & (np.abs(behind - before) > step), before, fill_gaps(com))
 
 
-def extend_flags(flagged: Flags, rows: int) -> Flags:
+def extend_flags(flags: Flags, rows: int) -> Flags:
     """The flagged rows, and so many after each."""
-    total = np.concatenate([np.zeros(rows + 1, int), np.cumsum(flagged)])
+    total = np.concatenate([np.zeros(rows + 1, int), np.cumsum(flags)])
     return total[rows + 1:] > total[:-rows - 1]
 
 
-def _find_frozen(x: Floats, mover: Floats, scale: float, longest: int = 200, moved: float = 1e-3, jump: float = 5.0
+def _find_frozen(x: Floats, mover: Floats, scale: float, longest: int = 200, least_way: float = 1e-3, jump: float = 5.0
                  ) -> Flags:
     """Rows in which `x` repeats one value while `mover` goes on, and then jumps, or never changes again.
 
@@ -778,10 +781,10 @@ def _find_frozen(x: Floats, mover: Floats, scale: float, longest: int = 200, mov
         mover: moves it if it is alive.
         scale: of the mover, as of `Trace.scale`.
         longest: equal rows that a live signal may have.
-        moved: how far the mover goes on, times the scale, for a signal that never changes again.
+        least_way: how far the mover goes on, times the scale, for a signal that never changes again.
         jump: steps, in usual ones, that a signal makes when it comes back.
     """
-    out = np.zeros(len(x), bool)
+    is_frozen = np.zeros(len(x), bool)
     steps = np.abs(np.diff(x))
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
     starts = np.flatnonzero(np.concatenate([[True], np.diff(x) != 0.0]))
@@ -790,10 +793,10 @@ def _find_frozen(x: Floats, mover: Floats, scale: float, longest: int = 200, mov
             continue
         way = float(np.nanmax(mover[first:stop]) - np.nanmin(mover[first:stop]))
         if stop == len(x):
-            out[first:stop] = way > moved * scale
+            is_frozen[first:stop] = way > least_way * scale
         else:
-            out[first:stop] = way > STILL * scale and steps[stop - 1] > jump * usual
-    return out
+            is_frozen[first:stop] = way > STILL * scale and steps[stop - 1] > jump * usual
+    return is_frozen
 
 
 def _starts_in_motion(trace: Trace, rows: int = 16, fast: float = 2e-3) -> bool:
@@ -831,14 +834,14 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int) -> Trace:
             if abs(way.period / first.period - 1.0) < SAME_PERIOD]
     require(ways, source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
     repeat = ways[0]
-    fitting = [late for late in (0, _find_first_move(first) - _find_first_move(repeat))
-               if has_same_command(first, repeat, late)]
-    require(fitting, source, first.declared.command.name,
+    delays = [late for late in (0, _find_first_move(first) - _find_first_move(repeat))
+              if has_same_command(first, repeat, late)]
+    require(delays, source, first.declared.command.name,
             "the command of the trace it repeats; another command is no repeat")
-    aligned = _align_repeat(repeat, fitting[0], len(first))
-    require(any(np.nansum(np.abs(aligned.column(name) - first.column(name))) > 0.0 for name in outputs), source, "",
-            "the same command run again; every sample of this one is that of the trace itself")
-    return aligned
+    aligned_repeat = _align_repeat(repeat, delays[0], len(first))
+    require(any(np.nansum(np.abs(aligned_repeat.column(name) - first.column(name))) > 0.0 for name in outputs),
+            source, "", "the same command run again; every sample of this one is that of the trace itself")
+    return aligned_repeat
 
 
 def _find_first_move(trace: Trace) -> int:
@@ -854,8 +857,8 @@ def has_same_command(one: Trace, other: Trace, late: int = 0, overlap: float = 0
     first, last = max(0, late), min(len(a), len(b) + late)
     if last - first < overlap * len(a):
         return False
-    same = np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION * one.scale
-    return bool(np.mean(same) >= same_share)
+    is_same = np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION * one.scale
+    return bool(np.mean(is_same) >= same_share)
 
 
 def _align_repeat(trace: Trace, late: int, rows: int) -> Trace:
@@ -865,7 +868,7 @@ def _align_repeat(trace: Trace, late: int, rows: int) -> Trace:
     """
     if late == 0 and len(trace) == rows:
         return trace
-    wanted = np.arange(rows) - late
-    place = np.clip(wanted, 0, len(trace) - 1)
-    usable = (wanted == place) & trace.usable[place]
+    repeat_rows = np.arange(rows) - late
+    place = np.clip(repeat_rows, 0, len(trace) - 1)
+    usable = (repeat_rows == place) & trace.usable[place]
     return trace.take_rows(place, usable=usable, incomplete=np.isnan(trace.controlled[place]) | ~usable)

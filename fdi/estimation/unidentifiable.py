@@ -143,12 +143,12 @@ def list_directions(problem: Problem, at: Mapping[str, float]) -> list[Direction
     share = at["valve.pressure_gain"] * at["jack.leakage"] / at.get("viscosity_drift.factor", 1.0)
     loss = {"valve.pressure_gain": share / max(share, at["valve.flow_gain"]),
             "jack.leakage": at["valve.flow_gain"] / max(share, at["valve.flow_gain"])}
-    every = [*(Direction({**flat, **effects}) for flat, effects in pairs), Direction(loss), Direction(VISCOSITY),
-             Direction(POSITION_SCALE), Direction(POSITION_SCALE_AT_FORCES),
-             Direction(FLAPPER, allowed=PRIORS_KNOW_MORE_MISFIT),
-             Direction(SPOOL_WAY, frozenset({"xs"}), PRIORS_KNOW_MORE_MISFIT),
-             Direction(JACK_PRESSURE, frozenset({"p12"}))]
-    return [each for each in every if not each.shown_by & set(problem.trace.outputs)]
+    directions = [*(Direction({**flat, **effects}) for flat, effects in pairs), Direction(loss), Direction(VISCOSITY),
+                  Direction(POSITION_SCALE), Direction(POSITION_SCALE_AT_FORCES),
+                  Direction(FLAPPER, allowed=PRIORS_KNOW_MORE_MISFIT),
+                  Direction(SPOOL_WAY, frozenset({"xs"}), PRIORS_KNOW_MORE_MISFIT),
+                  Direction(JACK_PRESSURE, frozenset({"p12"}))]
+    return [each for each in directions if not each.shown_by & set(problem.trace.outputs)]
 
 
 def list_powers(problem: Problem) -> list[Mapping[str, float]]:
@@ -157,27 +157,27 @@ def list_powers(problem: Problem) -> list[Mapping[str, float]]:
     return [{**flat, "pilot.flow_gain": -law} if "filter.clogging" in flat else flat for flat in FLAT]
 
 
-def scale_together(free: Sequence[Free], x: Floats, said: Mapping[str, float], logarithm: float) -> Floats:
-    """Scaled unknowns (p,) after those in `said` have been multiplied by their powers of exp(`logarithm`)."""
-    moved = x.copy()
+def scale_together(free: Sequence[Free], x: Floats, powers: Mapping[str, float], logarithm: float) -> Floats:
+    """Scaled unknowns (p,) after those in `powers` have been multiplied by their powers of exp(`logarithm`)."""
+    new_x = x.copy()
     for k, f in enumerate(free):
-        if f.name in said:
-            value, factor = f.centre + f.scale * float(x[k]), float(np.exp(said[f.name] * logarithm))
+        if f.name in powers:
+            value, factor = f.centre + f.scale * float(x[k]), float(np.exp(powers[f.name] * logarithm))
             origin = ORIGINS.get(f.name, 0.0)
-            moved[k] = (origin + (value - origin) * factor - f.centre) / f.scale
-    return moved
+            new_x[k] = (origin + (value - origin) * factor - f.centre) / f.scale
+    return new_x
 
 
-def scale_to(free: Sequence[Free], x: Floats, said: Mapping[str, float], name: str, value: float) -> Floats | None:
+def scale_to(free: Sequence[Free], x: Floats, powers: Mapping[str, float], name: str, value: float) -> Floats | None:
     """The same where that brings parameter `name` to a value; None if the powers do not move it there."""
     k = next((k for k, f in enumerate(free) if f.name == name), None)
     origin = ORIGINS.get(name, 0.0)
-    if k is None or name not in said:
+    if k is None or name not in powers:
         return None
-    now = free[k].centre + free[k].scale * float(x[k]) - origin
-    if (value - origin) * now <= 0.0:  # no factor leads from zero, or past it
+    distance = free[k].centre + free[k].scale * float(x[k]) - origin
+    if (value - origin) * distance <= 0.0:  # no factor leads from zero, or past it
         return None
-    return scale_together(free, x, said, math.log((value - origin) / now) / said[name])
+    return scale_together(free, x, powers, math.log((value - origin) / distance) / powers[name])
 
 
 def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[list[Direction], Floats]:
@@ -187,19 +187,19 @@ def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[li
     """
     low, high = scaled_bounds(free)
     names = {f.name for f in free}
-    every = [each for each in list_directions(problem, problem.list_values(free, x))
-             if next(iter(each.powers)) in names]
-    if not every:
+    directions = [each for each in list_directions(problem, problem.list_values(free, x))
+                  if next(iter(each.powers)) in names]
+    if not directions:
         return [], np.empty((len(x), 0))
-    trials = np.array([[scale_together(free, x, each.powers, TRIED * share) for each in every]
+    trials = np.array([[scale_together(free, x, each.powers, TRIED * share) for each in directions]
                        for share in TRIED_SHARES])
     is_tried = ((trials >= low - 1e-9) & (trials <= high + 1e-9)).all(axis=2) & (trials != x).any(axis=2)
     samples = sum(len(trace) for trace in (problem.trace, *problem.also))
-    allowed = np.array([each.allowed for each in every]) * samples / 13500.0
-    held = [every[k] for k in np.flatnonzero(confirm_flat(problem, free, x, trials, is_tried, allowed))]
-    ways = _list_tangents(free, x, held)
-    apart = _find_independent(ways)
-    return [held[k] for k in apart], ways[apart].T
+    limits = np.array([each.allowed for each in directions]) * samples / 13500.0
+    flat_directions = [directions[k] for k in np.flatnonzero(confirm_flat(problem, free, x, trials, is_tried, limits))]
+    ways = _list_tangents(free, x, flat_directions)
+    places = _find_independent(ways)
+    return [flat_directions[k] for k in places], ways[places].T
 
 
 def _list_tangents(free: Sequence[Free], x: Floats, directions: Sequence[Direction]) -> Floats:
@@ -209,7 +209,7 @@ def _list_tangents(free: Sequence[Free], x: Floats, directions: Sequence[Directi
 
 
 def confirm_flat(problem: Problem, free: Sequence[Free], x: Floats, trials: Floats, is_tried: Flags,
-                 allowed: float | Floats = FLAT_DIRECTION_MISFIT) -> Flags:
+                 most: float | Floats = FLAT_DIRECTION_MISFIT) -> Flags:
     """Which directions a trial replay finds flat at `x` (p,), (k,).
 
     Args:
@@ -218,18 +218,18 @@ def confirm_flat(problem: Problem, free: Sequence[Free], x: Floats, trials: Floa
         x: their scaled values (p,).
         trials: scaled unknowns (4, k, p) at each of `TRIED_SHARES` along each direction.
         is_tried: (4, k), False where a bound stops a trial.
-        allowed: change of the misfit, of a trial of full length, (k,) or one for all directions; a shorter one may
+        most: change of the misfit, of a trial of full length, (k,) or one for all directions; a shorter one may
             change its square's share.
     """
-    limits = np.array(TRIED_SHARES)[:, None] ** 2 * allowed * np.ones(is_tried.shape[1])
-    confirmed = np.zeros(is_tried.shape[1], bool)
+    limits = np.array(TRIED_SHARES)[:, None] ** 2 * most * np.ones(is_tried.shape[1])
+    is_flat = np.zeros(is_tried.shape[1], bool)
     for shares in ([0], [1, 2, 3]):  # most directions that are flat need no more than the first trial
-        due = is_tried & ~confirmed & np.isin(np.arange(len(is_tried)), shares)[:, None]
-        if due.any():
-            white = problem.compute_white_residuals(free, np.vstack([x, trials[due]]))
-            moved = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
-            confirmed[np.nonzero(due)[1][moved < limits[due]]] = True
-    return confirmed
+        is_due = is_tried & ~is_flat & np.isin(np.arange(len(is_tried)), shares)[:, None]
+        if is_due.any():
+            white = problem.compute_white_residuals(free, np.vstack([x, trials[is_due]]))
+            changes = ((white[1:] - white[0]) ** 2).sum(axis=(1, 2))
+            is_flat[np.nonzero(is_due)[1][changes < limits[is_due]]] = True
+    return is_flat
 
 
 def remove_slope(jacobian: Floats, flat: Floats) -> Floats:
@@ -241,29 +241,29 @@ def remove_slope(jacobian: Floats, flat: Floats) -> Floats:
     return (rows - basis @ (basis.T @ rows)).reshape(jacobian.shape)
 
 
-def relax_fit(problem: Problem, found: Fit, directions: Sequence[Direction]) -> Fit:
+def relax_fit(problem: Problem, fit: Fit, directions: Sequence[Direction]) -> Fit:
     """The fit moved along these flat directions to where the priors want it, if that leaves no more than before."""
-    free, x = found.free, found.x
+    free, x = fit.free, fit.x
     if not directions:
-        return found
+        return fit
     prior = weigh_priors(free)
     low, high = scaled_bounds(free)
     for _ in range(6):  # Gauss-Newton on the priors alone, along the curved directions
         ways = _list_tangents(free, x, directions).T
         step = -np.linalg.lstsq(ways.T @ (prior[:, None] * ways), ways.T @ (prior * x), rcond=None)[0]
         for way in (1.0, 0.5, 0.25, 0.1):
-            there = x
+            trial = x
             for each, part in zip(directions, step, strict=True):
-                there = scale_together(free, there, each.powers, way * float(part))
-            if ((there >= low) & (there <= high)).all() and there**2 @ prior < x**2 @ prior:
-                x = there
+                trial = scale_together(free, trial, each.powers, way * float(part))
+            if ((trial >= low) & (trial <= high)).all() and trial**2 @ prior < x**2 @ prior:
+                x = trial
                 break
         else:
             break
-    if found.x**2 @ prior - x**2 @ prior < CONVERGED_GAIN:  # not worth a replay
-        return found
-    moved = replay_fit(problem, found, x)
-    return moved if moved.cost < found.cost else found
+    if fit.x**2 @ prior - x**2 @ prior < CONVERGED_GAIN:  # not worth a replay
+        return fit
+    end = replay_fit(problem, fit, x)
+    return end if end.cost < fit.cost else fit
 
 
 def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
@@ -276,17 +276,17 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     they move by their power of their value.
     """
     at = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
-    said = [{**flat, **{name: power * at[name] for name, power in effects.items() if name in at}}
-            for flat, effects in zip(list_powers(problem), FLAT_WITH_EFFECTS, strict=True)]
-    every = [flat for flat in (*said, *others) if next(iter(flat)) in {f.name for f in free}]
-    ways = np.array([[get_power(flat, f) / f.scale for f in free] for flat in every]).reshape(-1, len(free))
+    powers = [{**flat, **{name: power * at[name] for name, power in effects.items() if name in at}}
+              for flat, effects in zip(list_powers(problem), FLAT_WITH_EFFECTS, strict=True)]
+    directions = [flat for flat in (*powers, *others) if next(iter(flat)) in {f.name for f in free}]
+    ways = np.array([[get_power(flat, f) / f.scale for f in free] for flat in directions]).reshape(-1, len(free))
     if not len(ways):
         return ways.T
     shares = np.array(TRIED_SHARES)
     steps = np.array([[cut_at_bounds(free, x, TRIED * share * way) for way in ways] for share in shares])
     whole = TRIED * np.abs(shares)[:, None] * np.abs(ways).max(axis=1)
     is_full = np.abs(steps).max(axis=2) >= 0.9 * whole
-    limits = np.array([allowed if flat in others else FLAT_DIRECTION_MISFIT for flat in every])
+    limits = np.array([allowed if flat in others else FLAT_DIRECTION_MISFIT for flat in directions])
     flat_ways = ways[confirm_flat(problem, free, x, x + steps, is_full, limits)]
     return flat_ways[_find_independent(flat_ways)].T
 
@@ -313,21 +313,21 @@ def choose_across(free: Sequence[Free], flat: Floats) -> NDArray[np.int64]:
     It is the first that the direction names in `FLAT`, else the one that moves furthest.
     """
     leading = np.array([f.name in [next(iter(v)) for v in FLAT] for f in free])
-    left = flat.copy()
-    left_out: list[int] = []
-    for i in range(left.shape[1]):  # elimination, so that directions with the same parameters leave out different ones
-        size = np.abs(left[:, i])
+    remainder = flat.copy()
+    pivots: list[int] = []
+    for i in range(flat.shape[1]):  # elimination, so that directions with the same parameters leave out different ones
+        size = np.abs(remainder[:, i])
         k = int(np.argmax(size * leading if (size * leading).max() > 1e-6 * size.max() else size))
-        left_out.append(k)
-        left[:, i + 1:] -= np.outer(left[:, i], left[k, i + 1:] / left[k, i])
-    return np.array([k for k in range(len(free)) if k not in left_out])
+        pivots.append(k)
+        remainder[:, i + 1:] -= np.outer(remainder[:, i], remainder[k, i + 1:] / remainder[k, i])
+    return np.array([k for k in range(len(free)) if k not in pivots])
 
 
-def relax_along(found: Fit, flat: Floats) -> Fit:
+def relax_along(fit: Fit, flat: Floats) -> Fit:
     """The fit moved along the flat directions to where the priors want it, within the bounds: no residual changes."""
-    prior = weigh_priors(found.free)
-    low, high = scaled_bounds(found.free)
-    x = found.x
+    prior = weigh_priors(fit.free)
+    low, high = scaled_bounds(fit.free)
+    x = fit.x
     for _ in range(len(flat.T) + 1):
         pull = flat.T @ (prior * x)
         way = -flat @ np.linalg.solve(flat.T @ (prior[:, None] * flat), pull) if flat.size else np.zeros(len(x))
@@ -336,8 +336,8 @@ def relax_along(found: Fit, flat: Floats) -> Fit:
         if room.min() >= 1.0:
             break
         flat = _keep_still(flat, int(np.argmin(room)))
-    cost = found.misfit + float(x**2 @ prior)
-    return replace(found, x=x, cost=cost) if cost < found.cost else found
+    cost = fit.misfit + float(x**2 @ prior)
+    return replace(fit, x=x, cost=cost) if cost < fit.cost else fit
 
 
 def _keep_still(flat: Floats, k: int) -> Floats:
@@ -395,12 +395,12 @@ def take_logarithm(f: Free) -> Free:
 
 def compute_values(free: Sequence[Free], x: Floats) -> Floats:
     """Parameters in SI units, (p,), of scaled unknowns (p,)."""
-    found = np.array([f.value(float(v)) for f, v in zip(free, x, strict=True)])
+    values = np.array([f.value(float(v)) for f, v in zip(free, x, strict=True)])
     names = [f.name for f in free]
     for k, f in enumerate(free):
         if isinstance(f, LogFrictionRatio):
-            found[k] *= found[names.index(f.leader)]
-    return limit_dynamic_friction(names, found)
+            values[k] *= values[names.index(f.leader)]
+    return limit_dynamic_friction(names, values)
 
 
 @dataclass
@@ -460,7 +460,7 @@ def take_curved_step(problem: Problem, fit: Fit) -> Fit:
         costs = compute_misfit(white) + x**2 @ prior
         if costs.min() < least:
             best, least = x[int(np.argmin(costs))], float(costs.min())
-        ends, gradients = list(x), [heavy @ left.reshape(-1) + prior * at for left, at in zip(white, x, strict=True)]
+        ends, gradients = list(x), [heavy @ r.reshape(-1) + prior * end for r, end in zip(white, x, strict=True)]
     return replay_fit(problem, fit, best) if least < fit.cost else fit
 
 
@@ -485,38 +485,38 @@ def finish_fit(problem: Problem, fit: Fit, rounds: int = 8, slopes: Problem | No
     return replace(relax_fit(problem, now, find_tangents(slopes, now.free, now.x)[0]), converged=True)
 
 
-def take_steps(problem: Problem, now: Fit, linearise: Callable[[Fit], Fit], rounds: int, stage: Stage,
+def take_steps(problem: Problem, fit: Fit, linearise: Callable[[Fit], Fit], rounds: int, stage: Stage,
                take_step: Callable[[Problem, Fit], Fit] = take_best_step) -> Fit:
     """A fit after so many rounds of damped Gauss-Newton steps, fewer if `PATIENCE` of them gain nothing."""
     idle = 0
     for _ in range(rounds):
-        here = linearise(now)
-        now = take_step(problem, here)
-        idle = idle + 1 if here.cost - now.cost < CONVERGED_GAIN else 0
+        start = linearise(fit)
+        fit = take_step(problem, start)
+        idle = idle + 1 if start.cost - fit.cost < CONVERGED_GAIN else 0
         stage.finish_step()
         if idle >= PATIENCE:
             break
-    return now
+    return fit
 
 
-def linearise_along(slopes: Problem, now: Fit, flat: Floats) -> Fit:
+def linearise_along(slopes: Problem, fit: Fit, flat: Floats) -> Fit:
     """A fit with its Jacobian by differences along the principal directions of its covariance, and the next covariance.
 
-    The residuals stay those of `now`; the differences are those of `slopes`. Along `flat` (p, k) there is no slope.
+    The residuals stay those of `fit`; the differences are those of `slopes`. Along `flat` (p, k) there is no slope.
     """
-    x = now.x
-    moves = np.array([cut_at_bounds(now.free, x, d) for d in _find_principal(now.covariance).T])
-    white = slopes.compute_white_residuals(now.free, np.vstack([x, x + moves]))
+    x = fit.x
+    moves = np.array([cut_at_bounds(fit.free, x, d) for d in _find_principal(fit.covariance).T])
+    white = slopes.compute_white_residuals(fit.free, np.vstack([x, x + moves]))
     steep = np.asarray(np.linalg.pinv(moves), np.float64) @ (white[1:] - white[0]).reshape(len(x), -1)
-    return _weigh_slopes(now, remove_slope(steep.reshape(len(x), *now.white.shape), flat))
+    return _weigh_slopes(fit, remove_slope(steep.reshape(len(x), *fit.white.shape), flat))
 
 
-def _weigh_slopes(now: Fit, jacobian: Floats) -> Fit:
+def _weigh_slopes(fit: Fit, jacobian: Floats) -> Fit:
     """A fit with this Jacobian (p, s, n), the covariance that follows from it, and its cost with the priors."""
-    x, prior = now.x, np.diag(weigh_priors(now.free))
-    heavy = (jacobian * compute_weights(now.white)).reshape(len(x), -1)
-    known = invert_hessian(heavy @ jacobian.reshape(len(x), -1).T + prior)
-    return replace(now, cost=now.misfit + float(x @ prior @ x), covariance=known, jacobian=jacobian)
+    x, prior = fit.x, np.diag(weigh_priors(fit.free))
+    heavy = (jacobian * compute_weights(fit.white)).reshape(len(x), -1)
+    covariance = invert_hessian(heavy @ jacobian.reshape(len(x), -1).T + prior)
+    return replace(fit, cost=fit.misfit + float(x @ prior @ x), covariance=covariance, jacobian=jacobian)
 
 
 def _find_principal(covariance: Floats) -> Floats:
@@ -526,7 +526,7 @@ def _find_principal(covariance: Floats) -> Floats:
     return wide
 
 
-def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stage: Stage = NO_STAGE,
+def descend_valley(problem: Problem, fit: Fit, rounds: int, flat: Floats, stage: Stage = NO_STAGE,
                    slopes: Problem | None = None) -> Fit:
     """A fit after so many rounds of steps across the valley, then moved along it to where the priors want it.
 
@@ -534,8 +534,8 @@ def descend_valley(problem: Problem, begun: Fit, rounds: int, flat: Floats, stag
     problem with coarser steps, for the differences; default `problem` itself.
     """
     linearise = partial(linearise_across, slopes or problem, flat=flat)
-    found = take_steps(problem, replay_fit(problem, begun, begun.x), linearise, rounds, stage)
-    return replace(relax_along(found, flat), converged=True)
+    end = take_steps(problem, replay_fit(problem, fit, fit.x), linearise, rounds, stage)
+    return replace(relax_along(end, flat), converged=True)
 
 
 def list_moves_across(free: Sequence[Free], covariance: Floats, flat: Floats, width: float
@@ -552,43 +552,43 @@ def list_moves_across(free: Sequence[Free], covariance: Floats, flat: Floats, wi
     return places, inverse, moves
 
 
-def estimate_smooth_covariance(problem: Problem, found: Fit, flat: Floats) -> Floats:
+def estimate_smooth_covariance(problem: Problem, fit: Fit, flat: Floats) -> Floats:
     """The covariance (p, p) of a fit by the slopes that the model has where it is smooth."""
     for _ in range(SMOOTH_PASSES):
-        found = linearise_smoothly(problem, found, flat)
-    return found.covariance
+        fit = linearise_smoothly(problem, fit, flat)
+    return fit.covariance
 
 
-def linearise_smoothly(slopes: Problem, now: Fit, flat: Floats) -> Fit:
+def linearise_smoothly(slopes: Problem, fit: Fit, flat: Floats) -> Fit:
     """A fit with its Jacobian by the slopes that the model has where it is smooth, and the next covariance.
 
     A stop that comes or goes within a difference makes it jump, and the jump is no slope: taken for one, it makes
     directions known that are not, and intervals too narrow. So differences are taken at several widths, either
     way, and each principal direction counts with the least of its slopes. The directions follow the covariance.
     """
-    free, x = now.free, now.x
+    free, x = fit.free, fit.x
     low, high = scaled_bounds(free)
-    places, inverse, ways = list_moves_across(free, now.covariance, flat, 1.0)
+    places, inverse, ways = list_moves_across(free, fit.covariance, flat, 1.0)
     moves = np.clip(x + np.multiply.outer(SMOOTH_WIDTHS, ways), low, high) - x
     white = slopes.compute_white_residuals(free, np.vstack([x, x + moves.reshape(-1, len(x))]))
     shifts = (white[1:] - white[0]).reshape(*moves.shape[:2], -1)
     length = np.linalg.norm(moves, axis=2) / np.linalg.norm(ways, axis=1)
     is_long = length > 0.5 * min(map(abs, SMOOTH_WIDTHS))  # others a bound has cut off
-    squares = (compute_weights(now.white).reshape(-1) * shifts**2).sum(axis=2)
+    squares = (compute_weights(fit.white).reshape(-1) * shifts**2).sum(axis=2)
     steepness = np.where(is_long, squares / np.maximum(length, 1e-9) ** 2, np.inf)
     least = steepness.argmin(axis=0), np.arange(len(ways))
     steep = np.asarray(np.linalg.pinv(moves[least][:, places]), np.float64) @ shifts[least]
-    return _weigh_slopes(now, (inverse.T @ steep).reshape(len(x), *now.white.shape))
+    return _weigh_slopes(fit, (inverse.T @ steep).reshape(len(x), *fit.white.shape))
 
 
-def linearise_across(slopes: Problem, now: Fit, flat: Floats) -> Fit:
+def linearise_across(slopes: Problem, fit: Fit, flat: Floats) -> Fit:
     """A fit with its Jacobian by differences across the valley, along principal directions there."""
-    free, x = now.free, now.x
-    places, inverse, ways = list_moves_across(free, now.covariance, flat, DIRECTION_WIDTH_SD)
+    free, x = fit.free, fit.x
+    places, inverse, ways = list_moves_across(free, fit.covariance, flat, DIRECTION_WIDTH_SD)
     moves = np.array([cut_at_bounds(free, x, way) for way in ways])
     white = slopes.compute_white_residuals(free, np.vstack([x, x + moves]))
     steep = np.asarray(np.linalg.pinv(moves[:, places]), np.float64) @ (white[1:] - white[0]).reshape(len(places), -1)
-    return _weigh_slopes(now, (inverse.T @ steep).reshape(len(x), *now.white.shape))
+    return _weigh_slopes(fit, (inverse.T @ steep).reshape(len(x), *fit.white.shape))
 
 
 def start_fit(free: Sequence[Free], x: Floats) -> Fit:
@@ -607,17 +607,17 @@ def guess_covariance(free: Sequence[Free], across: float = 1e-3) -> Floats:
     return np.diag([guess_variance(f) for f in free])
 
 
-def descend(problem: LogProblem, found: Fit, schedule: Sequence[tuple[float, int]],
+def descend(problem: LogProblem, fit: Fit, schedule: Sequence[tuple[float, int]],
             shown_by: LogProblem | None = None) -> Fit:
     """The fit after (factor, rounds) each: the noise so many times as large, so that small stops of the ram count late.
 
     Its covariance begins anew each time. `shown_by` tells which directions no signal shows, by default the problem.
     """
     for factor, rounds in schedule:
-        begun = replace(found, covariance=guess_covariance(found.free))
-        flat = (shown_by or problem).find_flat(found.free, found.x)
-        found = descend_valley(scale_noise(problem, factor), begun, rounds, flat, problem.stage)
-    return found
+        start = replace(fit, covariance=guess_covariance(fit.free))
+        flat = (shown_by or problem).find_flat(fit.free, fit.x)
+        fit = descend_valley(scale_noise(problem, factor), start, rounds, flat, problem.stage)
+    return fit
 
 
 def search_widely(problem: L, shown_by: LogProblem, home: Fit, widths: Floats, stages: Sequence[tuple[float, int]],
@@ -635,7 +635,7 @@ def search_widely(problem: L, shown_by: LogProblem, home: Fit, widths: Floats, s
     def slide(problem: L, fit: Fit, rounds: int, factor: float) -> Fit:
         return descend(problem, fit, ((factor, rounds),), shown_by)
 
-    begun = slide(problem, home, 3, stages[0][0])
-    spread = 9.0 * begun.covariance + np.diag(widths**2)
-    begun = replace(begun, x=np.where(widths > 0.0, home.x, begun.x))
-    return follow_population(problem, begun, spread, stages, seed, slide)
+    start = slide(problem, home, 3, stages[0][0])
+    spread = 9.0 * start.covariance + np.diag(widths**2)
+    start = replace(start, x=np.where(widths > 0.0, home.x, start.x))
+    return follow_population(problem, start, spread, stages, seed, slide)
