@@ -46,19 +46,19 @@ def parse_columns(data: bytes, where: object, period: float = 1 / RATE, signals:
     require("t" in titles, where, "line 1", "a header with a column t and commas between columns")
     load = signals.load
     plain = Signal("", "", "", "")
-    known = [("t", "t", plain), ("com", signals.command.name, signals.command), ("value", "value", plain),
-             *([("load", load.name, load)] if load else [])]
-    picked = [(key, name.lower(), signal) for key, name, signal in known if name.lower() in titles]
-    columns = read_columns(data, Layout("utf-8-sig", ",", ".", tuple(titles), 1, 2), [name for _, name, _ in picked],
+    candidates = [("t", "t", plain), ("com", signals.command.name, signals.command), ("value", "value", plain),
+                  *([("load", load.name, load)] if load else [])]
+    matches = [(key, name.lower(), signal) for key, name, signal in candidates if name.lower() in titles]
+    columns = read_columns(data, Layout("utf-8-sig", ",", ".", tuple(titles), 1, 2), [name for _, name, _ in matches],
                            where=where)
     t = columns["t"]
     require_growth(t, where, "t")
     _refuse_row(data, where, "t", t, t - t[0] > LONGEST, f"seconds, and at most {LONGEST:g} of them")
-    for _, name, signal in picked:
+    for _, name, signal in matches:
         _refuse_row(data, where, name, columns[name], ~np.isfinite(columns[name]), "a finite number")
         _refuse_row(data, where, name, columns[name], np.abs(columns[name]) > signal.largest,
                     f"at most {signal.largest:g} {signal.unit} either way")
-    return {key: resample_on_cycles(t, columns[name], period) for key, name, _ in picked if key != "t"}
+    return {key: resample_on_cycles(t, columns[name], period) for key, name, _ in matches if key != "t"}
 
 
 def _refuse_row(data: bytes, where: object, name: str, column: Array, is_bad: NDArray[np.bool_], expected: str) -> None:

@@ -47,13 +47,13 @@ def read_csv(path: Path, signals: Signals) -> tuple[dict[str, Floats], tuple[str
     """
     with report_unreadable(path, "UTF-8"), open_text(path) as stream:
         header = stream.readline()
-    if (found := find_own_table(partial(split_line, header))) is not None:
-        plant, table = found
+    if (match := find_own_table(partial(split_line, header))) is not None:
+        plant, table = match
         sources, notes = _read_known(path, split_line(header, table.separator), table.separator, sorted(table.sources))
         return combine_columns(sources, table), notes, plant.name, plant.signals
     names = split_line(header, ",")
-    known = (signals, *(find_plant(name).signals for name in list_plants() if not {*signals.required} <= {*names}))
-    signals = next((s for s in known if {*s.required} <= {*names}), signals)
+    choices = (signals, *(find_plant(name).signals for name in list_plants() if not {*signals.required} <= {*names}))
+    signals = next((s for s in choices if {*s.required} <= {*names}), signals)
     required = ("t", *signals.required)
     possible = (*required, *(name for name in signals.names if name not in required))
     for name in required:
@@ -63,16 +63,17 @@ def read_csv(path: Path, signals: Signals) -> tuple[dict[str, Floats], tuple[str
     return *_read_known(path, names, ",", [name for name in possible if name in names]), "", signals
 
 
-def _read_known(path: Path, names: Sequence[str], separator: str, known: Collection[str]
+def _read_known(path: Path, names: Sequence[str], separator: str, known_names: Collection[str]
                 ) -> tuple[dict[str, Floats], tuple[str, ...]]:
     """The known columns of a text with these names in its first line, and which were left out."""
     require(len(set(names)) == len(names), f"{path}: line 1", "header", "each column once")
-    columns = read_columns(path, Layout("utf-8-sig", separator, ".", tuple(names), 1, 2), known)
-    unknown = [name for name in names if name not in columns]
-    if len(unknown) < 2:
-        return columns, tuple(f"column {name} is not known and was left out" for name in unknown)
-    more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
-    return columns, (f"{len(unknown)} columns are not known and were left out: {', '.join(unknown[:3])}{more}",)
+    columns = read_columns(path, Layout("utf-8-sig", separator, ".", tuple(names), 1, 2), known_names)
+    unknown_names = [name for name in names if name not in columns]
+    if len(unknown_names) < 2:
+        return columns, tuple(f"column {name} is not known and was left out" for name in unknown_names)
+    more = f" and {len(unknown_names) - 3} more" if len(unknown_names) > 3 else ""
+    return columns, (f"{len(unknown_names)} columns are not known and were left out: "
+                     f"{', '.join(unknown_names[:3])}{more}",)
 
 
 def find_own_table(list_names: Callable[[str], Collection[str]]) -> tuple[Plant, Table] | None:
@@ -227,7 +228,7 @@ def combine_columns(sources: Mapping[str, Floats], table: Table) -> dict[str, Fl
     def shift_term(term: Term) -> Floats:
         return np.concatenate([(term.factor * sources[term.source])[term.later:], np.full(term.later, np.nan)])
 
-    summed = {name: sum(map(shift_term, terms), start=np.zeros(1)) for name, terms in table.columns.items()}
-    whole = summed | (table.derive(sources) if table.derive else {})
+    sums = {name: sum(map(shift_term, terms), start=np.zeros(1)) for name, terms in table.columns.items()}
+    whole = sums | (table.derive(sources) if table.derive else {})
     columns = {name: values[table.skip:] for name, values in whole.items()}
     return columns | ({"load": table.load(columns)} if table.load else {})

@@ -25,14 +25,14 @@ def read_declaration(where: object, metadata: Mapping[str, str]) -> Signals | No
     if DECLARATION not in metadata:
         return None
     try:
-        found = []
+        signals = []
         for table in json.loads(metadata[DECLARATION]):
             values: dict[str, Any] = {key: table[key] for key in USUAL if key in table}
             for key, value in values.items():
                 if type(value) is not type(USUAL[key]) and (type(value), type(USUAL[key])) != (int, float):
                     raise TypeError(f"{key} is {value!r:.40}")
                 values[key] = escape_control_characters(value) if isinstance(value, str) else value
-            found.append(Signal(**values))
-        return Signals(*found)
+            signals.append(Signal(**values))
+        return Signals(*signals)
     except (TypeError, ValueError, RecursionError, InputError) as error:
         raise InputError(where, f"metadata {DECLARATION}", f"the declaration of signals as JSON ({error})") from error

@@ -66,8 +66,8 @@ class Log:
         """
         with _report_damage(self.path, " and ".join(topics)):
             decode = self._find_decoders(topics)
-            found = sorted(self.list_raw_messages(decode.keys()), key=lambda message: message[1])
-            for channel, time_ns, data in found[:most]:
+            messages = sorted(self.list_raw_messages(decode.keys()), key=lambda message: message[1])
+            for channel, time_ns, data in messages[:most]:
                 topic, parse = decode[channel]
                 yield topic, time_ns, parse(data)
 
@@ -93,14 +93,14 @@ class Log:
 
     def _find_decoders(self, topics: Collection[str]) -> dict[int, tuple[str, Callable[[bytes], Any]]]:
         """Topic and parser of each channel of these topics, by its number."""
-        factory, found = DecoderFactory(), {}
+        factory, decoders = DecoderFactory(), {}
         for number, channel in self.channels.items():
             if channel.topic in topics:
                 parse = factory.decoder_for(channel.message_encoding, self.schemas.get(channel.schema_id))
                 if parse is None:
                     raise InputError(self.path, channel.topic, "protobuf messages")
-                found[number] = channel.topic, parse
-        return found
+                decoders[number] = channel.topic, parse
+        return decoders
 
     def list_raw_messages(self, channels: Set[int] | None = None) -> Iterator[tuple[int, int, bytes]]:
         """(channel, log time in ns, data) of every message, or of those of some channels, in the order of the file.
@@ -119,11 +119,11 @@ class Log:
         """The chunks that hold messages of these channels, unpacked, and where these begin; None: no index says it."""
         with self.path.open("rb") as stream:
             for index in self._chunks:
-                there = index.message_index_offsets
-                own = sorted(there.keys() & (channels or ()))
-                if there and channels is not None and not own:
+                offsets = index.message_index_offsets
+                numbers = sorted(offsets.keys() & (channels or ()))
+                if offsets and channels is not None and not numbers:
                     continue
-                starts = [_message_offsets(stream, index, number) for number in own]
+                starts = [_message_offsets(stream, index, number) for number in numbers]
                 yield _read_chunk(self.path, stream, index), np.sort(np.concatenate(starts)) if starts else None
 
     def read_units(self, topic: str) -> dict[str, str]:
@@ -179,11 +179,11 @@ def _check_sizes(path: Path, summary: Summary, size: int) -> None:
     Raises:
         InputError: it names the declared size.
     """
-    require((stored := sum(index.data_size for index in summary.attachment_indexes)) <= size, path, "attachments",
-            f"at most the {size} bytes of the file, not {stored}")
-    unpacked, most = sum(index.uncompressed_size for index in summary.chunk_indexes), limit_unpacked_size(size)
-    require(unpacked <= most, path, "chunks",
-            f"at most {most >> 20} MiB for {size} bytes packed, not {unpacked >> 20} MiB")
+    require((attachment_bytes := sum(index.data_size for index in summary.attachment_indexes)) <= size, path,
+            "attachments", f"at most the {size} bytes of the file, not {attachment_bytes}")
+    unpacked_size, most = sum(index.uncompressed_size for index in summary.chunk_indexes), limit_unpacked_size(size)
+    require(unpacked_size <= most, path, "chunks",
+            f"at most {most >> 20} MiB for {size} bytes packed, not {unpacked_size >> 20} MiB")
     require(len({index.chunk_start_offset for index in summary.chunk_indexes}) == len(summary.chunk_indexes), path,
             "chunks", "each chunk once in the index")
     for what, count in (("attachments", len(summary.attachment_indexes)), ("metadata", len(summary.metadata_indexes))):
@@ -236,15 +236,15 @@ def read_declarations(raw: bytes) -> list[Schema | Channel]:
 
     Raises struct.error or EndOfFile for a chunk that ends within a record.
     """
-    found: list[Schema | Channel] = []
+    declarations: list[Schema | Channel] = []
     for at in _list_records(raw):
         opcode, length = _RECORD.unpack_from(raw, at)
         body = ReadDataStream(BytesIO(raw[at + 9:at + 9 + length]))
         if opcode == Opcode.SCHEMA:
-            found.append(Schema.read(body))
+            declarations.append(Schema.read(body))
         elif opcode == Opcode.CHANNEL:
-            found.append(Channel.read(body))
-    return found
+            declarations.append(Channel.read(body))
+    return declarations
 
 
 LARGEST_CHUNK = 64 << 20  # bytes unpacked; this software writes chunks of 64 KiB, other writers of 1 to 4 MiB
@@ -262,9 +262,9 @@ class BoundedFile:
 
     def read(self, length: int = -1) -> bytes:
         """Read that many bytes. Raises EOFError where the file has fewer."""
-        left = self.size - self._stream.tell()
-        if length > left:
-            raise EOFError(f"{length} bytes declared, {max(left, 0)} left in the file")
+        rest = self.size - self._stream.tell()
+        if length > rest:
+            raise EOFError(f"{length} bytes declared, {max(rest, 0)} left in the file")
         return self._stream.read(length)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
@@ -301,9 +301,9 @@ def unpack_chunk(chunk: Chunk) -> bytes:
 def _unpack_zstd(packed: bytes, size: int) -> bytes:
     """Unpack one frame. The size in its header comes before the limit for zstandard, so it is compared here."""
     try:
-        declared = zstandard.get_frame_parameters(packed).content_size
-        if declared not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-            raise UnpackingError(f"it declares {size} bytes, its zstd frame {declared}")
+        content_size = zstandard.get_frame_parameters(packed).content_size
+        if content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise UnpackingError(f"it declares {size} bytes, its zstd frame {content_size}")
         unpacker = zstandard.ZstdDecompressor(max_window_size=2 * LARGEST_CHUNK)
         return unpacker.decompress(packed, max_output_size=size) if size else b""
     except zstandard.ZstdError as error:

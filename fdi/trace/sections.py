@@ -27,13 +27,13 @@ def describe_section(section: Section, furthest: float = 0.0, unit: str = "m") -
     >>> describe_section(Section("step", 500, 1500, 0.0, 5e-3, 0.0))
     'step to 5 mm'
     """
-    factor, shown = (1e3, "mm") if unit == "m" else (1.0, unit)
+    factor, display_unit = (1e3, "mm") if unit == "m" else (1.0, unit)
     match section.kind:
         case "ramp":
-            return f"ramp at {factor * section.rate:.3g} {shown}/s"
+            return f"ramp at {factor * section.rate:.3g} {display_unit}/s"
         case "dynamic":
-            return f"motion within {factor * furthest:.4g} {shown}"
-    return f"{section.kind} {'to' if section.kind == 'step' else 'at'} {factor * section.last:.4g} {shown}"
+            return f"motion within {factor * furthest:.4g} {display_unit}"
+    return f"{section.kind} {'to' if section.kind == 'step' else 'at'} {factor * section.last:.4g} {display_unit}"
 
 
 def find_sections(command: Floats, period: float = 1e-3, scale: float = 1.0) -> list[Section]:
@@ -59,8 +59,8 @@ def find_sections(command: Floats, period: float = 1e-3, scale: float = 1.0) -> 
             out[-1] = out[-1]._replace(stop=stop, last=float(com[stop - 1]))
         else:
             out.append(Section(kind, start, stop, float(before), float(com[stop - 1]), rate))
-    merged = _merge_short_parts(out, shortest)
-    return [s._replace(first=s.first * scale, last=s.last * scale, rate=s.rate * scale) for s in merged]
+    sections = _merge_short_parts(out, shortest)
+    return [s._replace(first=s.first * scale, last=s.last * scale, rate=s.rate * scale) for s in sections]
 
 
 def _find_lines(com: Floats) -> list[tuple[int, int, float]]:
@@ -101,8 +101,8 @@ def _merge_short_parts(parts: list[Section], shortest: int) -> list[Section]:
     """Scraps between lines go to the neighbour before; a ramp that only bends is a slow curve: dynamic."""
     out: list[Section] = []
     for part in parts:
-        scrap = part.kind == "dynamic" and part.stop - part.start < shortest // 10
-        if (out and scrap and out[-1].kind != "hold") or (out and out[-1].kind == part.kind == "dynamic"):
+        is_scrap = part.kind == "dynamic" and part.stop - part.start < shortest // 10
+        if (out and is_scrap and out[-1].kind != "hold") or (out and out[-1].kind == part.kind == "dynamic"):
             out[-1] = out[-1]._replace(stop=part.stop, last=part.last)
         elif out and part.kind == "ramp" and out[-1].kind == "ramp" and 0.5 < part.rate / out[-1].rate < 2:
             out[-1] = out[-1]._replace(kind="dynamic", stop=part.stop, last=part.last, rate=0.0)

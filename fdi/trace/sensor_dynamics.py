@@ -147,15 +147,15 @@ def read_sensors(where: object, metadata: Mapping[str, str]) -> dict[str, Sensor
     Raises:
         InputError: text that is no dynamics.
     """
-    found = {}
+    sensors = {}
     for key, text in metadata.items():
         if key.startswith(PREFIX):
             place = Place(str(where), keys=f"metadata run.{key}")
             try:
-                found[key.removeprefix(PREFIX)] = build_dataclass(SensorDynamics, json.loads(text), place)
+                sensors[key.removeprefix(PREFIX)] = build_dataclass(SensorDynamics, json.loads(text), place)
             except (ValueError, RecursionError) as error:
                 raise place.refuse(f"a sensor's dynamics as JSON, not {text!r}") from error
-    return found
+    return sensors
 
 
 FEWEST_VALUES = 20  # distinct ones that show how finely a column was recorded
@@ -195,12 +195,13 @@ def is_rounding_left(residual: Floats, step: float, resolution: float) -> bool:
         step: of the input, in the unit of the answer.
         resolution: RMS of what else is rounded, in the same unit.
     """
-    left = np.abs(residual[~np.isnan(residual)])
-    if not left.size:
+    magnitudes = np.abs(residual[~np.isnan(residual)])
+    if not magnitudes.size:
         return False
-    inside = left <= 0.5 * step + 3.0 * resolution
+    is_inside = magnitudes <= 0.5 * step + 3.0 * resolution
     least = 0.3 * step / np.sqrt(12.0)  # an input that rests on one step leaves less than the usual 1
-    return bool(inside.mean() >= ROUNDED_SHARE and np.sqrt(np.mean(left[inside] ** 2)) > max(least, 3.0 * resolution))
+    return bool(is_inside.mean() >= ROUNDED_SHARE
+                and np.sqrt(np.mean(magnitudes[is_inside] ** 2)) > max(least, 3.0 * resolution))
 
 
 def measure_resolution(x: Floats) -> float:
@@ -215,8 +216,8 @@ def measure_resolution(x: Floats) -> float:
     digits, places = 1, -30
     for value in values[values != 0.0].tolist():
         mantissa, _, exponent = f"{value:.11e}".partition("e")  # 12 digits: more is rounding of a float
-        shown = mantissa.lstrip("-").replace(".", "").rstrip("0")
-        digits, places = max(digits, len(shown)), max(places, len(shown) - 1 - int(exponent))
+        figures = mantissa.lstrip("-").replace(".", "").rstrip("0")
+        digits, places = max(digits, len(figures)), max(places, len(figures) - 1 - int(exponent))
     size = np.floor(np.log10(np.maximum(np.abs(values), 1e-300)))
     steps = np.where(values == 0.0, 0.0, 10.0 ** (size - digits + 1))
     return float(np.sqrt(np.mean(np.maximum(steps, 10.0**-places) ** 2)))

@@ -190,15 +190,15 @@ class Trace:
 
     def take_rows(self, rows: NDArray[np.int64] | slice, **fields: Any) -> Trace:
         """The same trace with these of its rows, and other `fields`."""
-        kept: dict[str, Any] = {name: getattr(self, name)[rows] for name in PER_ROW}
+        row_fields: dict[str, Any] = {name: getattr(self, name)[rows] for name in PER_ROW}
         chambers = None if self.chambers is None else self.chambers[rows]
         columns = {name: column[rows] for name, column in self.columns.items()}
-        return replace(self, **{**kept, "columns": columns, "chambers": chambers, "lead": {}, **fields})
+        return replace(self, **{**row_fields, "columns": columns, "chambers": chambers, "lead": {}, **fields})
 
     def with_columns(self, columns: Mapping[str, Floats], **fields: Any) -> Trace:
         """The same trace with other columns for these signals, and other `fields`. Raises KeyError."""
-        if unknown := columns.keys() - self.columns.keys():
-            raise KeyError(unknown.pop())
+        if unknown_names := columns.keys() - self.columns.keys():
+            raise KeyError(unknown_names.pop())
         return replace(self, columns={**self.columns, **columns}, **fields)
 
     def join_lead(self) -> Trace:
@@ -222,8 +222,8 @@ class Trace:
                     **fields: Any) -> Trace:
         """The same trace with other inputs, (n,) each, and other `fields`."""
         d = self.declared
-        given = ((d.command, command), (d.drive, drive), (d.load, load))
-        return self.with_columns({s.name: column for s, column in given if s is not None and column is not None},
+        inputs = ((d.command, command), (d.drive, drive), (d.load, load))
+        return self.with_columns({s.name: column for s, column in inputs if s is not None and column is not None},
                                  **fields)
 
     @cached_property
@@ -233,8 +233,8 @@ class Trace:
         It is the largest command that the plant declares, else a hundred times the range of this one; in an open loop
         those of the controlled signal.
         """
-        sized = self.declared.controlled if self.declared.is_open_loop else self.declared.command
-        return measure_scale(sized, self.columns[sized.name])
+        signal = self.declared.controlled if self.declared.is_open_loop else self.declared.command
+        return measure_scale(signal, self.columns[signal.name])
 
     def mask_unusable(self, name: str) -> Floats:
         """A column, NaN where it is missing or its row cannot be used."""
@@ -259,11 +259,11 @@ class Trace:
         """A model's outputs, (.., n, outputs), as the sensors of this trace show them."""
         if not self.sensors:
             return outputs
-        shown = outputs.copy()
+        readings = outputs.copy()
         for i, name in enumerate(self.output_names):
             if name in self.sensors:
-                shown[..., i] = self.sensors[name].apply(outputs[..., i], self.period)
-        return shown
+                readings[..., i] = self.sensors[name].apply(outputs[..., i], self.period)
+        return readings
 
     @property
     def filtered(self) -> tuple[str, ...]:
@@ -290,9 +290,9 @@ class Trace:
 
     def __repr__(self) -> str:
         source = self.provenance.get("source", "")
-        measured = ", ".join(name for name in self.output_names if name in self.signals)
+        names = ", ".join(name for name in self.output_names if name in self.signals)
         of = f" of {source}" if source else ""
-        return f"<Trace{of}: {len(self)} cycles of {1e3 * self.period:g} ms, {len(self) * self.period:g} s, {measured}>"
+        return f"<Trace{of}: {len(self)} cycles of {1e3 * self.period:g} ms, {len(self) * self.period:g} s, {names}>"
 
     def sections(self) -> list[Section]:
         """Hold, step, ramp and dynamic sections of the command in this trace."""
@@ -305,10 +305,10 @@ class Trace:
 
     def write_csv(self, path: str | Path) -> None:
         """Write t and the measured signals; missing cycles become gaps in t. Raises InputError."""
-        measured = {*self.declared.required, *self.signals}
-        names = ("t", *(name for name in self.declared.names if name in measured))
-        there = ~np.all([np.isnan(self.column(name)) for name in names[1:]], axis=0)
-        write_csv(Path(path), {name: self.column(name)[there] for name in names})
+        measured_names = {*self.declared.required, *self.signals}
+        names = ("t", *(name for name in self.declared.names if name in measured_names))
+        has_value = ~np.all([np.isnan(self.column(name)) for name in names[1:]], axis=0)
+        write_csv(Path(path), {name: self.column(name)[has_value] for name in names})
 
 
 def make_table_trace(path: Path, columns: dict[str, Floats], signals: Signals, notes: tuple[str, ...] = (),
@@ -357,10 +357,10 @@ def _make_trace(grid: Mapping[str, Floats], signals: Signals, period: float, row
     return Trace(t=t, declared=signals, columns=columns, period=period, gaps=gaps, **fields)
 
 
-def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
-    recorded = read_declaration(log.path, log.metadata.get(DECLARATION, {}))
-    if recorded is not None and not set(declared.names) < set(recorded.names):  # a model need not know all of them
-        declared = recorded
+def _from_log(log: Log, all_phases: bool, declared: Signals) -> Trace:
+    declaration = read_declaration(log.path, log.metadata.get(DECLARATION, {}))
+    if declaration is not None and not set(declared.names) < set(declaration.names):  # a model need not know them all
+        declared = declaration
     signals, timing = log.read_columns("/signals"), log.read_columns("/timing")
     rest = {name: [(time_ns, message) for _, time_ns, message in log.read_messages(name, most=MOST_MESSAGES)]
             for name in ("/events", "/nmt", "/checks")}
@@ -378,28 +378,28 @@ def _from_log(log: Log, everything: bool, declared: Signals) -> Trace:
         raise InputError(log.path, "/signals.cycle", f"each cycle once, not {cycle[:-1][np.diff(cycle) == 0][0]} again")
     period = _find_period(log, run, table[:, 0] * 1e-9, cycle)
     main = np.flatnonzero(phase == MAIN)
-    require(everything or len(main), log.path, "/signals.phase", "a main phase; this run ended in its set-up")
+    require(all_phases or len(main), log.path, "/signals.phase", "a main phase; this run ended in its set-up")
     first = main[0] if len(main) else 0
-    kept = slice(None) if everything else slice(main[0], main[-1] + 1)
+    span = slice(None) if all_phases else slice(main[0], main[-1] + 1)
     seconds = _make_clock(table[:, 0], (cycle - cycle[first]) * period, table[first, 0])
-    rows, lead = cycle[kept] - cycle[kept][0], dict[str, Floats]()
-    grid = _spread_rows(log.path, rows, {name: table[kept, 3 + i] for i, name in enumerate(names)}
-                        | {"phase": phase[kept].astype(float)})
-    if first and not everything:
+    rows, lead = cycle[span] - cycle[span][0], dict[str, Floats]()
+    grid = _spread_rows(log.path, rows, {name: table[span, 3 + i] for i, name in enumerate(names)}
+                        | {"phase": phase[span].astype(float)})
+    if first and not all_phases:
         before = _spread_rows(log.path, cycle[:first + 1] - cycle[0],
                               {name: table[:first + 1, 3 + i] for i, name in enumerate(names)})
         lead = {name: column[:-1] for name, column in before.items()}
-    filled = hold_last(grid.pop("phase"))
-    grid["t"] = np.round((np.arange(len(filled)) + (cycle[kept][0] - cycle[first])) * period, 9)
+    row_phases = hold_last(grid.pop("phase"))
+    grid["t"] = np.round((np.arange(len(row_phases)) + (cycle[span][0] - cycle[first])) * period, 9)
     more = {f"{name}.{key}": value for name, record in log.metadata.items() if name not in ("run", DECLARATION)
             for key, value in record.items()}  # as `verdict.status`
-    said = {escape_control_characters(key): escape_control_characters(text) for key, text in {**run, **more}.items()}
-    return _make_trace(grid, declared, period, rows, phase=filled.astype(int),
-                       provenance={"source": log.path.name, **said},
+    texts = {escape_control_characters(key): escape_control_characters(text) for key, text in {**run, **more}.items()}
+    return _make_trace(grid, declared, period, rows, phase=row_phases.astype(int),
+                       provenance={"source": log.path.name, **texts},
                        units={s.name: s.unit for s in declared} | log.read_units("/signals"),
                        attachments=log.attachments,
                        notes=tuple(notes), sensors=read_sensors(log.path, run), lead=lead,
-                       timing=_select_timing(timing, cycle[kept], int(cycle[first]), period),
+                       timing=_select_timing(timing, cycle[span], int(cycle[first]), period),
                        events=tuple(_list_records(log, "/events", Event, rest, seconds)),
                        nmt=tuple(_list_records(log, "/nmt", Nmt, rest, seconds)),
                        checks=tuple(_list_records(log, "/checks", CheckResult, rest, seconds)))
@@ -417,11 +417,11 @@ def _list_records(log: Log, topic: str, kind: type[R], rest: Mapping[str, Messag
     fields = get_type_hints(kind)
     for time_ns, message in rest[topic]:
         values: dict[str, Any] = {}
-        for name, expected in fields.items():
+        for name, field_type in fields.items():
             absent = getattr(kind, name, None)  # logs of earlier versions lack a field that has a default
             value = seconds(time_ns) if name == "t" else getattr(message, name, absent)
-            if not isinstance(value, str | int | float) or isinstance(value, str) != (expected is str):
-                raise InputError(log.path, f"{topic}.{name}", f"a field of this name with a {expected.__name__}")
+            if not isinstance(value, str | int | float) or isinstance(value, str) != (field_type is str):
+                raise InputError(log.path, f"{topic}.{name}", f"a field of this name with a {field_type.__name__}")
             values[name] = escape_control_characters(value) if isinstance(value, str) else value
         yield kind(**values)
 
@@ -439,13 +439,14 @@ def _require_numbers(log: Log, topic: str, columns: Mapping[str, NDArray[Any]], 
 
 def _find_period(log: Log, run: Mapping[str, str], t: Floats, cycle: NDArray[np.int64]) -> float:
     """The run's own figure, else the median over the cycles, to the microsecond."""
-    said = run.get("period", round(float(np.median(np.diff(t) / np.diff(cycle))), 6) if len(t) > 1 else 1e-3)
+    figure = run.get("period", round(float(np.median(np.diff(t) / np.diff(cycle))), 6) if len(t) > 1 else 1e-3)
     try:
-        period = float(said)
+        period = float(figure)
     except ValueError:
         period = math.nan
     # the bounds hold for no NaN
-    require(1e-6 <= period <= 3600.0, log.path, "metadata run.period", f"seconds, from 1e-6 to 3600, not {str(said)!r}")
+    require(1e-6 <= period <= 3600.0, log.path, "metadata run.period",
+            f"seconds, from 1e-6 to 3600, not {str(figure)!r}")
     return period
 
 
@@ -455,24 +456,24 @@ def _make_clock(time_ns: Floats, t: Floats, zero_ns: float) -> Callable[[float],
     Rows were logged at `time_ns` and stand at `t`, shape (rows,) both; a real-time run that was late by whole periods
     has jumps in the first and none in the second. Before the first row and after the last a second is a second.
     """
-    logged = np.maximum.accumulate(time_ns - zero_ns) / 1e9
+    log_times = np.maximum.accumulate(time_ns - zero_ns) / 1e9
 
     def convert_to_seconds(at_ns: float) -> float:
         at = (at_ns - zero_ns) / 1e9
-        beyond = min(at - logged[0], 0.0) + max(at - logged[-1], 0.0)
-        return round(float(np.interp(at, logged, t) + beyond), 9)
+        beyond = min(at - log_times[0], 0.0) + max(at - log_times[-1], 0.0)
+        return round(float(np.interp(at, log_times, t) + beyond), 9)
 
     return convert_to_seconds
 
 
 def _select_timing(columns: Mapping[str, NDArray[Any]], cycles: NDArray[np.int64], zero: int, period: float) -> Timing:
     """Of the cycles that have a row; t = 0 at cycle `zero`."""
-    kept = np.isin(columns.get("cycle", []), cycles)
-    if not kept.any():
+    has_row = np.isin(columns.get("cycle", []), cycles)
+    if not has_row.any():
         return NO_TIMING
-    t = (columns["cycle"][kept].astype(int) - zero) * period
-    absent = np.full(len(kept), math.nan)
-    return Timing(np.round(t, 9), *(columns.get(name, absent)[kept] for name in Timing._fields[1:]))
+    t = (columns["cycle"][has_row].astype(int) - zero) * period
+    absent = np.full(len(has_row), math.nan)
+    return Timing(np.round(t, 9), *(columns.get(name, absent)[has_row] for name in Timing._fields[1:]))
 
 
 # Single columns, shape (n,): missing samples are NaN.
@@ -501,8 +502,8 @@ def hold_next(x: Floats) -> Floats:
 
 def fill_gaps(x: Floats) -> Floats:
     """`x` with straight lines over its missing samples, the end values beyond the first and the last; else zeros."""
-    rows, there = np.arange(len(x)), ~np.isnan(x)
-    return np.interp(rows, rows[there], x[there]) if there.any() else np.zeros(len(x))
+    rows, has_value = np.arange(len(x)), ~np.isnan(x)
+    return np.interp(rows, rows[has_value], x[has_value]) if has_value.any() else np.zeros(len(x))
 
 
 def shift_rows(x: Floats, rows: int) -> Floats:
@@ -520,33 +521,33 @@ def bridge_gaps(x: Floats, longest: int) -> tuple[Floats, Flags]:
     Longer gaps, and one at the start, hold the last sample and are flagged in the second result. Straight lines replace
     the cubics at the ends and where the samples beside a gap are far apart.
     """
-    missing = np.isnan(x)
+    is_missing = np.isnan(x)
     rows = np.arange(len(x))
-    there = rows[~missing]
-    filled = np.interp(rows, there, x[there])
-    flagged = np.zeros(len(x), bool)
-    for first, stop in np.flatnonzero(np.diff(missing, prepend=False, append=False)).reshape(-1, 2):
-        flagged[first:stop] = stop - first > longest or first == 0
-    gaps = rows[missing & ~flagged]
-    after = np.searchsorted(there, gaps)
-    inner = (after >= 2) & (after < len(there) - 1)
-    gaps, near = gaps[inner], there[after[inner][:, None] + np.arange(-2, 2)]
-    narrow = near[:, 3] - near[:, 0] <= longest + 5
-    filled[gaps[narrow]] = _interpolate_cubic(near[narrow], x[near[narrow]], gaps[narrow])
-    return np.where(flagged, hold_last(x), filled), flagged
+    sample_rows = rows[~is_missing]
+    values = np.interp(rows, sample_rows, x[sample_rows])
+    is_unknown = np.zeros(len(x), bool)
+    for first, stop in np.flatnonzero(np.diff(is_missing, prepend=False, append=False)).reshape(-1, 2):
+        is_unknown[first:stop] = stop - first > longest or first == 0
+    gaps = rows[is_missing & ~is_unknown]
+    after = np.searchsorted(sample_rows, gaps)
+    is_inner = (after >= 2) & (after < len(sample_rows) - 1)
+    gaps, neighbours = gaps[is_inner], sample_rows[after[is_inner][:, None] + np.arange(-2, 2)]
+    is_narrow = neighbours[:, 3] - neighbours[:, 0] <= longest + 5
+    values[gaps[is_narrow]] = _interpolate_cubic(neighbours[is_narrow], x[neighbours[is_narrow]], gaps[is_narrow])
+    return np.where(is_unknown, hold_last(x), values), is_unknown
 
 
 def rms(x: Floats) -> float:
     """Root mean square of the samples that are there; NaN if there are none."""
-    there = x[~np.isnan(x)]
-    return float(np.sqrt(np.mean(there**2))) if len(there) else float("nan")
+    samples = x[~np.isnan(x)]
+    return float(np.sqrt(np.mean(samples**2))) if len(samples) else float("nan")
 
 
-def _interpolate_cubic(at: NDArray[np.int64], values: Floats, wanted: NDArray[np.int64]) -> Floats:
-    """Lagrange's cubics through `values` (m, 4) at rows `at` (m, 4), evaluated at rows `wanted` (m,)."""
-    out = np.zeros(len(wanted))
+def _interpolate_cubic(at: NDArray[np.int64], values: Floats, rows: NDArray[np.int64]) -> Floats:
+    """Lagrange's cubics through `values` (m, 4) at rows `at` (m, 4), evaluated at `rows` (m,)."""
+    out = np.zeros(len(rows))
     for i in range(4):
         others = [j for j in range(4) if j != i]
-        parts = (wanted[:, None] - at[:, others]) / (at[:, [i]] - at[:, others])
+        parts = (rows[:, None] - at[:, others]) / (at[:, [i]] - at[:, others])
         out += values[:, i] * parts.prod(axis=1)
     return out

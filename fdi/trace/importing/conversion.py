@@ -166,15 +166,15 @@ def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
             signals.
     """
     table, place = parse_table(text, str(path))
-    found = build_dataclass(ImportMap, table, place, path=path, text=text, declared=declared)
-    place.at("signals").require(isinstance(found.signals, dict), "a table of signals")
-    signals = {name: _parse_signal(name, own, place.at("signals", name), declared)
-               for name, own in found.signals.items()}
+    import_map = build_dataclass(ImportMap, table, place, path=path, text=text, declared=declared)
+    place.at("signals").require(isinstance(import_map.signals, dict), "a table of signals")
+    signals = {name: _parse_signal(name, signal_table, place.at("signals", name), declared)
+               for name, signal_table in import_map.signals.items()}
     for name in declared.required:
-        needed = declared.find(name)
+        required_signal = declared.find(name)
         place.at("signals", name).require(
-            name in signals or (declared.is_open_loop and needed == declared.command),
-            f"a table with the source of {needed.symbol}, {needed.quantity}")
+            name in signals or (declared.is_open_loop and required_signal == declared.command),
+            f"a table with the source of {required_signal.symbol}, {required_signal.quantity}")
     owner: dict[str, str] = {}
     for name, signal in signals.items():
         other = owner.setdefault(signal.source, name)
@@ -183,23 +183,23 @@ def parse_map(text: str, path: Path, declared: Signals = EHA) -> ImportMap:
             f"a column of its own; signals.{other} has {signal.source!r} already")
     # in an open loop the drive is the command
     signals.setdefault(declared.command.name, signals[declared.drive.name])
-    return replace(found, signals=signals)
+    return replace(import_map, signals=signals)
 
 
 def _parse_signal(name: str, table: Any, place: Place, declared: Signals) -> SignalMap:
     place.require(name in declared.names, list_choices(name, declared.names))
-    known, minus = declared.find(name), table.get("minus") if isinstance(table, dict) else None
+    plant_signal, minus = declared.find(name), table.get("minus") if isinstance(table, dict) else None
     if minus is not None:  # what it does not say is as of the other chamber
-        usual = {key: table[key] for key in ("unit", "sign", "scale", "offset") if key in table}
-        own = {"source": minus} if isinstance(minus, str) else minus
-        table = {**table, "minus": usual | own if isinstance(own, dict) else own}
+        defaults = {key: table[key] for key in ("unit", "sign", "scale", "offset") if key in table}
+        keys = {"source": minus} if isinstance(minus, str) else minus
+        table = {**table, "minus": defaults | keys if isinstance(keys, dict) else keys}
     signal = build_dataclass(SignalMap, table, place)
     for term, at in ((signal, place), (signal.minus, place.at("minus"))):
         if term is not None:
             with at.locate(has_field=True):
-                term.find_unit(known.unit, "", "unit")
+                term.find_unit(plant_signal.unit, "", "unit")
     outputs = ", ".join(s.name for s in declared.outputs)
-    place.at("sensor").require(known.role == "output" or not signal.make_dynamics(known.unit).filters,
+    place.at("sensor").require(plant_signal.role == "output" or not signal.make_dynamics(plant_signal.unit).filters,
                                f"moving_mean and lag for {outputs} alone; {name} is an input of the model and is used "
                                "as recorded")
     return signal
@@ -236,9 +236,9 @@ def compute_times(base: TimeBase, samples: int, column: Floats | None, where: ob
     if column is None:
         assert base.rate is not None  # a base without source has a rate
         return np.arange(samples) / base.rate
-    missing = np.isnan(column)
-    if missing.any():
-        raise InputError(where, field, f"a time in every row; row {int(missing.argmax()) + 1} has none")
+    is_missing = np.isnan(column)
+    if is_missing.any():
+        raise InputError(where, field, f"a time in every row; row {int(is_missing.argmax()) + 1} has none")
     if base.bits is not None and base.rate is not None:
         return unwrap_counter(column, base.bits, where, field) / base.rate
     t = column - column[0] if base.is_calendar else convert_to_si(column, require_unit(base.unit, "s", where, field))
@@ -296,39 +296,40 @@ class Imported:
     used: frozenset[str]  # columns of the recording that the map names
 
 
-def import_measurement(measurement: Measurement, chosen: ImportMap, cycle: float) -> Imported:
+def import_measurement(measurement: Measurement, import_map: ImportMap, cycle: float) -> Imported:
     """The trace that a map makes of a recording.
 
     Args:
         measurement: the recording.
-        chosen: its map.
+        import_map: its map.
         cycle: s, the model's; the rows' period unless the map has one, or the recording is slower.
 
     Raises:
         InputError: a column, time or value that cannot be used.
     """
-    channels = _read_channels(measurement, chosen)
-    samples = {name: _scale(measurement, chosen, name, channels) for name in chosen.signals}
-    period = chosen.trace.period or _measure_cycle(samples[chosen.declared.controlled.name], cycle)
-    rows = _make_rows(chosen, samples, period)
-    columns, done, sensors, signals = {}, [], {}, chosen.declared
-    for name, signal in chosen.signals.items():
-        own, part = samples[name], CYCLE_PARTS.get(signals.find(name).role, "")
-        x, how = place_samples(own, rows, period, signal.method, signal.low_pass, part)
-        require(not np.isnan(x).all(), chosen.path, f"signals.{name}", "samples within the time of the other signals")
-        sensors[name], how = _find_sensor(signal, own, rows, how, period, signals.find(name).unit)
+    channels = _read_channels(measurement, import_map)
+    samples = {name: _scale(measurement, import_map, name, channels) for name in import_map.signals}
+    period = import_map.trace.period or _measure_cycle(samples[import_map.declared.controlled.name], cycle)
+    rows = _make_rows(import_map, samples, period)
+    columns, imported_signals, sensors, signals = {}, [], {}, import_map.declared
+    for name, signal in import_map.signals.items():
+        series, part = samples[name], CYCLE_PARTS.get(signals.find(name).role, "")
+        x, how = place_samples(series, rows, period, signal.method, signal.low_pass, part)
+        require(not np.isnan(x).all(), import_map.path, f"signals.{name}",
+                "samples within the time of the other signals")
+        sensors[name], how = _find_sensor(signal, series, rows, how, period, signals.find(name).unit)
         columns[name] = x
         source = f"{signal.source} - {signal.minus.source}" if signal.minus else signal.source
-        done.append(ImportedSignal(name, source, _describe_unit(signal, signals.find(name).unit), 1.0 / own.period,
-                                   float(np.nanmin(x)), float(np.nanmax(x)),
-                                   int((np.diff(own.t) > 1.5 * own.period).sum()), int(np.isnan(x).sum()), how))
+        imported_signals.append(ImportedSignal(
+            name, source, _describe_unit(signal, signals.find(name).unit), 1.0 / series.period, float(np.nanmin(x)),
+            float(np.nanmax(x)), int((np.diff(series.t) > 1.5 * series.period).sum()), int(np.isnan(x).sum()), how))
     origin = {"imported": measurement.path.name, "imported.sha256": hash_file(measurement.path),
-              "imported.format": measurement.format, "imported.map": chosen.path.name,
-              "imported.map_sha256": hashlib.sha256(chosen.text.encode()).hexdigest(),
+              "imported.format": measurement.format, "imported.map": import_map.path.name,
+              "imported.map_sha256": hashlib.sha256(import_map.text.encode()).hexdigest(),
               "imported.start": repr(float(rows[0]))}
     trace = replace(Trace.from_columns(columns, period, origin, signals),
                     sensors={name: sensor for name, sensor in sensors.items() if not sensor.is_ideal})
-    return Imported(trace, tuple(done), frozenset(channels))
+    return Imported(trace, tuple(imported_signals), frozenset(channels))
 
 
 def hash_file(path: Path) -> str:
@@ -337,49 +338,49 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _read_channels(measurement: Measurement, chosen: ImportMap) -> Mapping[str, Channel]:
+def _read_channels(measurement: Measurement, import_map: ImportMap) -> Mapping[str, Channel]:
     """All channels that the map names, read at once.
 
     Raises:
         InputError: a name that is no channel of the recording, with the field of the map and the nearest channel.
     """
-    bases = {"time": chosen.time}
-    wanted = {}  # field of the map: channel
-    for name, signal in chosen.signals.items():
+    bases = {"time": import_map.time}
+    sources = {}  # field of the map: channel
+    for name, signal in import_map.signals.items():
         bases[f"signals.{name}.time"] = signal.time
-        wanted[f"signals.{name}.source"] = signal.source
+        sources[f"signals.{name}.source"] = signal.source
         if signal.minus:
-            wanted[f"signals.{name}.minus.source"] = signal.minus.source
-    timed = {place: base for place, base in bases.items() if base and base.source}
-    wanted |= {f"{place}.source": str(base.source) for place, base in timed.items()}
-    for place, name in wanted.items():
+            sources[f"signals.{name}.minus.source"] = signal.minus.source
+    column_bases = {place: base for place, base in bases.items() if base and base.source}
+    sources |= {f"{place}.source": str(base.source) for place, base in column_bases.items()}
+    for place, name in sources.items():
         if name not in measurement.units:
-            shown = ", ".join(list(measurement.units)[:12]) + (", .." if len(measurement.units) > 12 else "")
-            raise InputError(chosen.path, place, f"a column of {measurement.path.name} ({shown}), not {name!r}"
-                                                 f"{suggest_name(name, measurement.units)}")
-    return measurement.read(list(dict.fromkeys(wanted.values())),
-                            [str(base.source) for base in timed.values() if base.is_calendar])
+            examples = ", ".join(list(measurement.units)[:12]) + (", .." if len(measurement.units) > 12 else "")
+            raise InputError(import_map.path, place, f"a column of {measurement.path.name} ({examples}), not {name!r}"
+                                                     f"{suggest_name(name, measurement.units)}")
+    return measurement.read(list(dict.fromkeys(sources.values())),
+                            [str(base.source) for base in column_bases.values() if base.is_calendar])
 
 
-def _scale(measurement: Measurement, chosen: ImportMap, name: str, channels: Mapping[str, Channel]) -> Samples:
+def _scale(measurement: Measurement, import_map: ImportMap, name: str, channels: Mapping[str, Channel]) -> Samples:
     """A signal's samples in SI at their true times, missing ones left out."""
-    signal, si = chosen.signals[name], chosen.declared.find(name).unit
+    signal, si = import_map.signals[name], import_map.declared.find(name).unit
     channel = channels[signal.source]
     x = _convert(channel.values, signal, si)
-    t = _find_times(measurement, chosen, signal, channel, channels) - signal.delay
+    t = _find_times(measurement, import_map, signal, channel, channels) - signal.delay
     if signal.minus:
         other = channels[signal.minus.source]
         if len(other.values) != len(x) or (other.t is not None and channel.t is not None
                                               and not np.array_equal(other.t, channel.t)):
-            raise InputError(chosen.path, f"signals.{name}.minus", "a channel with the same times")
+            raise InputError(import_map.path, f"signals.{name}.minus", "a channel with the same times")
         x = x - _convert(other.values, signal.minus, si)
     dead = signal.sensor.dead
-    there = ~np.isnan(x) & (dead is not True)
+    has_value = ~np.isnan(x) & (dead is not True)
     for first, last in () if isinstance(dead, bool) else dead:
-        there &= (t < first) | (t > last)
-    reason = "it is marked dead; leave it out of the map" if dead else f"it has {int(there.sum())}"
-    require(there.sum() >= 2, measurement.path, signal.source, f"at least two values; {reason}")
-    return Samples(t, x) if there.all() else Samples(t[there], x[there])
+        has_value &= (t < first) | (t > last)
+    reason = "it is marked dead; leave it out of the map" if dead else f"it has {int(has_value.sum())}"
+    require(has_value.sum() >= 2, measurement.path, signal.source, f"at least two values; {reason}")
+    return Samples(t, x) if has_value.all() else Samples(t[has_value], x[has_value])
 
 
 def _convert(values: Floats, term: SourceTerm, si: str) -> Floats:
@@ -388,12 +389,12 @@ def _convert(values: Floats, term: SourceTerm, si: str) -> Floats:
     return x if term.sign > 0 else 0.0 - x
 
 
-def _find_times(measurement: Measurement, chosen: ImportMap, signal: SignalMap, channel: Channel,
+def _find_times(measurement: Measurement, import_map: ImportMap, signal: SignalMap, channel: Channel,
                 channels: Mapping[str, Channel]) -> Floats:
-    base = signal.time or chosen.time
+    base = signal.time or import_map.time
     if base is None:
         if channel.t is None:
-            raise InputError(chosen.path, "time", "a table with source (a column) or rate (rows a second)")
+            raise InputError(import_map.path, "time", "a table with source (a column) or rate (rows a second)")
         require_growth(channel.t, measurement.path, signal.source, COUNTER)
         return channel.t
     column = channels[base.source].values if base.source else None
@@ -403,25 +404,26 @@ def _find_times(measurement: Measurement, chosen: ImportMap, signal: SignalMap, 
     return compute_times(base, len(channel.values), column, measurement.path, base.source or "rate")
 
 
-def _measure_cycle(own: Samples, cycle: float) -> float:
+def _measure_cycle(samples: Samples, cycle: float) -> float:
     """The model's cycle, or the controlled signal's period if longer; by the recording's clock if that drifts."""
-    nominal = cycle if own.period < 1.25 * cycle else round(own.period, 6)
-    rows = float(np.rint(np.diff(own.t) / own.period).sum())
-    mean = float(own.t[-1] - own.t[0]) / rows
+    nominal = cycle if samples.period < 1.25 * cycle else round(samples.period, 6)
+    rows = float(np.rint(np.diff(samples.t) / samples.period).sum())
+    mean = float(samples.t[-1] - samples.t[0]) / rows
     ratio = max(1, round(nominal / mean)) if mean < nominal else 1
     return nominal if abs(mean * ratio / nominal - 1.0) * rows / ratio < SLIP else round(mean * ratio, 9)
 
 
-def _make_rows(chosen: ImportMap, samples: Mapping[str, Samples], period: float) -> Floats:
+def _make_rows(import_map: ImportMap, samples: Mapping[str, Samples], period: float) -> Floats:
     """Times of the rows: from the first sample that all required signals share to the last, on the controlled one's."""
-    needed = [samples[name] for name in chosen.declared.required]
-    first = max(-math.inf if chosen.trace.start is None else chosen.trace.start, *(s.t[0] for s in needed))
-    last = min(math.inf if chosen.trace.end is None else chosen.trace.end, *(s.t[-1] for s in needed))
-    origin = _find_origin(samples[chosen.declared.controlled.name], samples[chosen.declared.drive.name], period)
+    series = [samples[name] for name in import_map.declared.required]
+    first = max(-math.inf if import_map.trace.start is None else import_map.trace.start, *(s.t[0] for s in series))
+    last = min(math.inf if import_map.trace.end is None else import_map.trace.end, *(s.t[-1] for s in series))
+    origin = _find_origin(samples[import_map.declared.controlled.name], samples[import_map.declared.drive.name], period)
     start = origin + period * math.ceil((first - origin) / period - 0.5)
     count = math.floor((last - start) / period + 0.5) + 1
-    require(count >= 2, chosen.path, "signals", f"{', '.join(chosen.declared.required)} recorded at the same time")
-    require(count <= MOST_ROWS, chosen.path, "time",
+    require(count >= 2, import_map.path, "signals",
+            f"{', '.join(import_map.declared.required)} recorded at the same time")
+    require(count <= MOST_ROWS, import_map.path, "time",
             f"at most {MOST_ROWS} rows of {period:g} s, not {count}; is the unit of the time right?")
     out: Floats = start + period * np.arange(count)
     return out
@@ -429,11 +431,11 @@ def _make_rows(chosen: ImportMap, samples: Mapping[str, Samples], period: float)
 
 def _find_origin(controlled: Samples, drive: Samples, period: float) -> float:
     """The time of a row: the first sample of the controlled signal, or where one of both, held, brings a new value."""
-    for held in (controlled, drive):
-        ratio = round(period / held.period)
-        phase = find_hold(held, ratio) if ratio > 1 else None
+    for samples in (controlled, drive):
+        ratio = round(period / samples.period)
+        phase = find_hold(samples, ratio) if ratio > 1 else None
         if phase is not None:
-            return float(held.t[0] + phase * held.period)
+            return float(samples.t[0] + phase * samples.period)
     return float(controlled.t[0])
 
 
@@ -504,20 +506,21 @@ def place_samples(samples: Samples, rows: Floats, period: float, method: str, lo
     whole = round(ratio)
     is_whole = whole >= 1 and abs(ratio / whole - 1.0) * len(rows) < 0.5 * whole + 0.01 * len(rows)
     if method in ("auto", "samples") and whole == 1 and is_whole:
-        placed = _place_each(samples, rows, period)
-        if placed is not None:
-            return placed
+        placement = _place_each(samples, rows, period)
+        if placement is not None:
+            return placement
     if method in ("auto", "samples") and whole > 1 and is_whole:
         return _pick(samples, rows, period, whole, low_pass, cycle_part)
     if method == "samples":
         return _place_nearest(samples, rows, 0.5 * period), "nearest sample"
-    apart = f"{1e3 * samples.period:.4g} ms apart"
+    spacing = f"{1e3 * samples.period:.4g} ms apart"
     is_stepwise = len(samples.x) > 10 and float(np.mean(np.diff(samples.x) == 0.0)) > 0.5  # most repeat the one before
     if method == "hold" or (method == "auto" and cycle_part and is_stepwise):
-        return _hold(samples, rows), f"last sample, {apart}"
+        return _hold(samples, rows), f"last sample, {spacing}"
     if ratio > 1.5 and low_pass is not False:
-        return _interpolate(_filter(samples, ratio), rows), f"low-pass filtered, straight lines between samples {apart}"
-    return _interpolate(samples, rows), f"straight lines between samples {apart}"
+        return (_interpolate(_filter(samples, ratio), rows),
+                f"low-pass filtered, straight lines between samples {spacing}")
+    return _interpolate(samples, rows), f"straight lines between samples {spacing}"
 
 
 def _place_each(samples: Samples, rows: Floats, period: float) -> tuple[Floats, str] | None:
@@ -537,12 +540,12 @@ def _place_each(samples: Samples, rows: Floats, period: float) -> tuple[Floats, 
 def _pick(samples: Samples, rows: Floats, period: float, ratio: int, low_pass: bool | None, cycle_part: str
           ) -> tuple[Floats, str]:
     """Every so many samples; those of a held signal where its new value is."""
-    held = find_hold(samples, ratio)
+    phase = find_hold(samples, ratio)
     how = f"every {_format_ordinal(ratio)} sample"
-    if held is not None:
-        own = (samples.t[0] + held * samples.period - rows[0]) % period
-        own = 0.0 if own > period - 0.25 * samples.period else own
-        shift = {"answer": own, "demand": own - period if own else 0.0}.get(cycle_part, 0.0)
+    if phase is not None:
+        offset = (samples.t[0] + phase * samples.period - rows[0]) % period
+        offset = 0.0 if offset > period - 0.25 * samples.period else offset
+        shift = {"answer": offset, "demand": offset - period if offset else 0.0}.get(cycle_part, 0.0)
         return _place_nearest(samples, rows + shift, 0.6 * samples.period), f"{how}; the signal is held for {ratio}"
     if low_pass is None:
         low_pass = not cycle_part and _measure_folded_share(samples, ratio) > FOLDED_SHARE
@@ -564,19 +567,19 @@ def _place_nearest(samples: Samples, rows: Floats, reach: float) -> Floats:
 
 def _hold(samples: Samples, rows: Floats) -> Floats:
     before = np.searchsorted(samples.t, rows + 1e-9, side="right") - 1
-    held = np.clip(before, 0, None)
-    late = rows - samples.t[held] > 1.5 * samples.period
-    return np.where((before < 0) | late, math.nan, samples.x[held])
+    place = np.clip(before, 0, None)
+    is_late = rows - samples.t[place] > 1.5 * samples.period
+    return np.where((before < 0) | is_late, math.nan, samples.x[place])
 
 
 def _interpolate(samples: Samples, rows: Floats) -> Floats:
     """Straight lines between samples; NaN in gaps and outside."""
     after = np.searchsorted(samples.t, rows)
     left, right = np.clip(after - 1, 0, len(samples.t) - 1), np.clip(after, 0, len(samples.t) - 1)
-    lost = (samples.t[right] - samples.t[left] > 1.5 * samples.period)
-    exact = samples.t[right] == rows
-    lost |= (rows < samples.t[0] - 1e-9) | (rows > samples.t[-1] + 1e-9)
-    return np.where(lost & ~exact, math.nan, np.interp(rows, samples.t, samples.x))
+    is_gap = (samples.t[right] - samples.t[left] > 1.5 * samples.period)
+    is_exact = samples.t[right] == rows
+    is_gap |= (rows < samples.t[0] - 1e-9) | (rows > samples.t[-1] + 1e-9)
+    return np.where(is_gap & ~is_exact, math.nan, np.interp(rows, samples.t, samples.x))
 
 
 def _filter(samples: Samples, ratio: float) -> Samples:

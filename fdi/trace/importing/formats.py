@@ -151,8 +151,8 @@ def _open_parquet(path: Path) -> Measurement:
 
     units = {}
     for column in file.schema_arrow:
-        said = (column.metadata or {}).get(b"unit", b"").decode(errors="replace")
-        units[column.name] = "s" if str(column.type).startswith("timestamp") else said or split_unit(column.name)[1]
+        unit = (column.metadata or {}).get(b"unit", b"").decode(errors="replace")
+        units[column.name] = "s" if str(column.type).startswith("timestamp") else unit or split_unit(column.name)[1]
     return Measurement(path, "Parquet", units, read_singly(read))
 
 
@@ -210,12 +210,12 @@ def split_unit(name: str) -> tuple[str, str]:
     >>> split_unit("Kolbenweg [mm]"), split_unit("druck_bar"), split_unit("state")
     (('Kolbenweg', 'mm'), ('druck', 'bar'), ('state', ''))
     """
-    found = re.fullmatch(r"(.*?)\s*[\[(<{]\s*([^\])>}]*)\s*[\])>}]\s*", name)
-    if found:
-        return found[1].strip(), found[2].strip()
-    found = re.fullmatch(r"(.+?)\s*[/_ ]\s*([A-Za-zµμ%]+)", name)
-    if found and _is_unit(found[2]) and found[2] not in ("a", "n", "v", "in", "S", "h"):
-        return found[1].strip(), found[2]
+    match = re.fullmatch(r"(.*?)\s*[\[(<{]\s*([^\])>}]*)\s*[\])>}]\s*", name)
+    if match:
+        return match[1].strip(), match[2].strip()
+    match = re.fullmatch(r"(.+?)\s*[/_ ]\s*([A-Za-zµμ%]+)", name)
+    if match and _is_unit(match[2]) and match[2] not in ("a", "n", "v", "in", "S", "h"):
+        return match[1].strip(), match[2]
     return name.strip(), ""
 
 
@@ -246,7 +246,7 @@ def _is_number(text: str, parse: Callable[[str], float]) -> bool:
 
 def _find_separators(path: Path, lines: list[str], separator: str | None, decimal: str | None) -> tuple[str, str]:
     """The pair under which most fields are numbers."""
-    best, found = 0.0, ("", "")
+    best, separators = 0.0, ("", "")
     body = [line for line in lines if not is_comment(line)]
     for sep, dec in product([separator] if separator else SEPARATORS, [decimal] if decimal else (".", ",")):
         rows, parse = [split_line(line, sep) for line in body], make_number_parser(dec)
@@ -257,9 +257,9 @@ def _find_separators(path: Path, lines: list[str], separator: str | None, decima
                  for cell in row]
         score = len(cells) * (sum(_is_number(cell, parse) for cell in cells) / max(len(cells), 1)) ** 3
         if score > best:
-            best, found = score, (sep, dec)
+            best, separators = score, (sep, dec)
     require(best, path, "", "a table with at least two columns of numbers")
-    return found
+    return separators
 
 
 def _find_width(rows: list[list[str]], parse: Callable[[str], float]) -> int:
@@ -290,7 +290,7 @@ def _find_names(path: Path, rows: list[list[str]], lines: list[str], first: int,
     names = [name or f"column {i + 1}" for i, name in enumerate(names)]
     units = [split_unit(name)[1] for name in names]
     if len(above) > 1 and _is_unit_line(rows[above[1]]):
-        units = [own.strip("[]() ") or unit for own, unit in zip(rows[above[1]], units, strict=True)]
+        units = [cell.strip("[]() ") or unit for cell, unit in zip(rows[above[1]], units, strict=True)]
     return names, units, above[0] + 1 if above else 0
 
 
@@ -306,8 +306,8 @@ def _find_names_in_comment(lines: list[str], first: int, width: int) -> list[str
 
 def _is_unit_line(row: list[str]) -> bool:
     cells = [cell.strip("[]() ") for cell in row]
-    known = sum(_is_unit(cell) for cell in cells if cell and cell != "-")
-    return known > 0 and known >= 0.5 * sum(bool(cell) and cell != "-" for cell in cells)
+    unit_count = sum(_is_unit(cell) for cell in cells if cell and cell != "-")
+    return unit_count > 0 and unit_count >= 0.5 * sum(bool(cell) and cell != "-" for cell in cells)
 
 
 class Channel(NamedTuple):

@@ -82,8 +82,8 @@ class Columns(NamedTuple):
 
     def has_raw_unit(self, name: str, si: str) -> bool:
         """Whether the recording names a unit that scale and offset must convert to the quantity with this SI unit."""
-        said, unit = self.units[name], find_unit(self.units[name])
-        return bool(said) and not fit_unit(said, si) and (unit is None or said in OTHER_UNITS)
+        unit_name, unit = self.units[name], find_unit(self.units[name])
+        return bool(unit_name) and not fit_unit(unit_name, si) and (unit is None or unit_name in OTHER_UNITS)
 
     def measures(self, name: str, si: str) -> bool:
         """Whether the unit of a column is one of the quantity with this SI unit."""
@@ -101,25 +101,25 @@ class GuessedMap(NamedTuple):
 
 def guess_map(measurement: Measurement, signals: Signals = EHA) -> GuessedMap:
     """The map of a recording of a plant with these `signals`, whose columns are not known."""
-    every = Columns(_read_numbers(measurement),
-                    {name: said or split_unit(name)[1] for name, said in measurement.units.items()})
-    time_lines, time_source, time_confidence = _guess_time(measurement, every)
-    columns = every._replace(data={name: x for name, x in every.data.items() if name != time_source})
-    found = _assign(columns, signals)
-    _scale_position(found, columns, signals)
-    _find_signs(found, columns, signals)
-    _find_steps(found, columns, signals)
-    chosen = {"time": (time_source or "its own times", time_confidence),
-              **{name: (guess.source, guess.confidence) for name, guess in found.items()}}
-    used = {column for guess in found.values() for column in (guess.source, guess.minus)} | {time_source}
-    left = {name: _describe_left(name, columns, found, signals) for name in measurement.units if name not in used}
+    all_columns = Columns(_read_numbers(measurement),
+                          {name: unit_name or split_unit(name)[1] for name, unit_name in measurement.units.items()})
+    time_lines, time_source, time_confidence = _guess_time(measurement, all_columns)
+    columns = all_columns._replace(data={name: x for name, x in all_columns.data.items() if name != time_source})
+    guesses = _assign(columns, signals)
+    _scale_position(guesses, columns, signals)
+    _find_signs(guesses, columns, signals)
+    _find_steps(guesses, columns, signals)
+    choices = {"time": (time_source or "its own times", time_confidence),
+               **{name: (guess.source, guess.confidence) for name, guess in guesses.items()}}
+    sources = {column for guess in guesses.values() for column in (guess.source, guess.minus)} | {time_source}
+    rest = {name: _describe_left(name, columns, guesses, signals) for name in measurement.units if name not in sources}
     lines = [f"# First map of {measurement.path.name} ({measurement.format}), guessed: check every line.",
              f"# Then: rig import {measurement.path.name} --map THIS_FILE", "", *_list_file_lines(measurement),
              *time_lines, "", *(line for signal in signals[1:]
-                                for line in _list_signal_lines(signal, signals, found.get(signal.name), columns)),
-             *(["# Columns that were left out:"] if left else []),
-             *(f"#   {name} ({why})" for name, why in left.items())]
-    return GuessedMap("\n".join(lines) + "\n", chosen, left, signals)
+                                for line in _list_signal_lines(signal, signals, guesses.get(signal.name), columns)),
+             *(["# Columns that were left out:"] if rest else []),
+             *(f"#   {name} ({why})" for name, why in rest.items())]
+    return GuessedMap("\n".join(lines) + "\n", choices, rest, signals)
 
 
 def _read_numbers(measurement: Measurement) -> dict[str, Floats]:
@@ -134,10 +134,10 @@ def _read_numbers(measurement: Measurement) -> dict[str, Floats]:
     out = {}
     for name, channel in channels.items():
         x = channel.values[:SAMPLE]
-        there = np.flatnonzero(~np.isnan(x))
-        if len(there) > 1:
-            last = np.clip(np.searchsorted(there, np.arange(len(x)), side="right") - 1, 0, None)
-            out[name] = x[there[last]]
+        places = np.flatnonzero(~np.isnan(x))
+        if len(places) > 1:
+            last = np.clip(np.searchsorted(places, np.arange(len(x)), side="right") - 1, 0, None)
+            out[name] = x[places[last]]
     return out
 
 
@@ -153,8 +153,8 @@ def _has_word(name: str, words: str) -> str:
     plain = _simplify_name(name)
     for word in words.split("|"):
         pattern = word if len(word.replace(" ?", "")) >= 4 and word[-2:-1] != " " else rf"(?<=[ 0-9]){word}(?=[ 0-9])"
-        if found := re.search(pattern, plain):
-            return found[0]
+        if match := re.search(pattern, plain):
+            return match[0]
     return ""
 
 
@@ -162,8 +162,8 @@ def _guess_time(measurement: Measurement, columns: Columns) -> tuple[list[str], 
     """The lines of [time], its column and how sure it is."""
     if measurement.has_times:
         return ["# Each channel has times of its own: no [time] needed."], None, "sure"
-    rated = [_rate_time(name, x, columns) for name, x in columns.data.items()]
-    best = max((guess for guess in rated if guess.points), key=lambda guess: guess.points, default=None)
+    guesses = [_rate_time(name, x, columns) for name, x in columns.data.items()]
+    best = max((guess for guess in guesses if guess.points), key=lambda guess: guess.points, default=None)
     if best is None:
         texts = (n for n in columns.units if n not in columns.data)
         date = next((n for n in texts if _has_word(n, TIME_WORDS + "|date|datum")), None)
@@ -193,9 +193,9 @@ def _rate_time(name: str, x: Floats, columns: Columns) -> Guess:
     return guess
 
 
-def _guess_time_unit(said: str, x: Floats) -> str:
+def _guess_time_unit(unit_name: str, x: Floats) -> str:
     """The line of the time's unit: the header's, or one in which the steps are those of a logger."""
-    unit = find_unit(said)
+    unit = find_unit(unit_name)
     if unit is not None and unit.si == "s":
         return f'unit = "{unit.name}"  # as the header says'
     step = float(np.median(np.diff(x)))
@@ -206,18 +206,18 @@ def _guess_time_unit(said: str, x: Floats) -> str:
 
 def _assign(columns: Columns, signals: Signals) -> dict[str, Guess]:
     """Each signal's column: the pair of most points first."""
-    rated = [(signal.name, guess) for column, x in columns.data.items() if float(np.ptp(x)) > 0.0
-             for signal in list_recorded(signals)
-             if (guess := _rate_column(signal, signals, column, columns)) is not None]
-    found: dict[str, Guess] = {}
-    for name, guess in sorted(rated, key=lambda pair: -pair[1].points):
-        if name not in found and guess.source not in {g.source for g in found.values()}:
-            found[name] = guess
-    _guess_by_motion(found, columns, signals)
+    candidates = [(signal.name, guess) for column, x in columns.data.items() if float(np.ptp(x)) > 0.0
+                  for signal in list_recorded(signals)
+                  if (guess := _rate_column(signal, signals, column, columns)) is not None]
+    guesses: dict[str, Guess] = {}
+    for name, guess in sorted(candidates, key=lambda pair: -pair[1].points):
+        if name not in guesses and guess.source not in {g.source for g in guesses.values()}:
+            guesses[name] = guess
+    _guess_by_motion(guesses, columns, signals)
     for signal in signals.outputs[1:]:
-        if signal.unit == "Pa" and signal.name in found:
-            _pair_chambers(found[signal.name], columns.data)
-    return {name: found[name] for name in signals.names if name in found}
+        if signal.unit == "Pa" and signal.name in guesses:
+            _pair_chambers(guesses[signal.name], columns.data)
+    return {name: guesses[name] for name in signals.names if name in guesses}
 
 
 def list_recorded(signals: Signals) -> list[Signal]:
@@ -230,16 +230,16 @@ def _list_words(signal: Signal, signals: Signals) -> list[tuple[str, float]]:
     by_role = {signals.command: "command", signals.controlled: "controlled", signals.load: "load"}
     unit = find_unit(signal.unit)  # a plant may declare degrees
     first, *others = WORDS.get(by_role.get(signal, unit.si if unit else signal.unit), ()) or ((None, 0.0),)
-    own = "|".join(dict.fromkeys(re.escape(word.strip()) for word in map(_simplify_name, (signal.name, signal.symbol))
-                                 if word.strip()))
-    return [(own, OWN_WORD) if first[0] is None else (f"{own}|{first[0]}", first[1]), *others]
+    own_words = "|".join(dict.fromkeys(
+        re.escape(word.strip()) for word in map(_simplify_name, (signal.name, signal.symbol)) if word.strip()))
+    return [(own_words, OWN_WORD) if first[0] is None else (f"{own_words}|{first[0]}", first[1]), *others]
 
 
 def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns) -> Guess | None:
     """How well a column fits a signal by name, unit and range; None if its name or its unit excludes it."""
-    said, si = columns.units[column], signal.unit
-    unit = fit_unit(said, si)
-    if unit is None and said and not columns.has_raw_unit(column, si):
+    unit_name, si = columns.units[column], signal.unit
+    unit = fit_unit(unit_name, si)
+    if unit is None and unit_name and not columns.has_raw_unit(column, si):
         return None
     guess = Guess(column, unit or Unit(si, si, Fraction(1)))
     for words, worth in _list_words(signal, signals):
@@ -248,26 +248,26 @@ def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns
     if not guess.points:
         return None
     place = "controlled" if signal == signals.controlled else signal.role
-    known = RANGES.get(place if si == "m" else si)
-    low, high, units = known or (0.0, math.inf, (si,))
+    usual_range = RANGES.get(place if si == "m" else si)
+    low, high, units = usual_range or (0.0, math.inf, (si,))
     x = columns.data[column]
     size = float(np.percentile(np.abs(x - np.median(x)), 99))
-    fitting = [u for u in units if known and low <= size * float(UNITS[u].factor) <= high]
-    suits = f"no unit given, its range of {size:.3g} suits {' or '.join(fitting)}"
+    likely_units = [u for u in units if usual_range and low <= size * float(UNITS[u].factor) <= high]
+    suits = f"no unit given, its range of {size:.3g} suits {' or '.join(likely_units)}"
     findings = (
-        (unit is not None, 2.0, f"its unit is {said}"),
-        (said, -2.0, f"its unit {said!r} needs scale and offset"),
-        (not known, 0.0, "no unit given"),
-        (len(fitting) == 1, 1.0, suits),
-        (fitting, 0.0, suits),
+        (unit is not None, 2.0, f"its unit is {unit_name}"),
+        (unit_name, -2.0, f"its unit {unit_name!r} needs scale and offset"),
+        (not usual_range, 0.0, "no unit given"),
+        (len(likely_units) == 1, 1.0, suits),
+        (likely_units, 0.0, suits),
         (True, -1.0, f"no unit given, and its range of {size:.3g} suits none: counts?"))
     guess.note(*next((points, reason) for holds, points, reason in findings if holds))
-    if fitting and not said:
-        guess.unit = UNITS[fitting[0]]
+    if likely_units and not unit_name:
+        guess.unit = UNITS[likely_units[0]]
     amplitude = size * float(guess.unit.factor)
-    if known and low <= amplitude <= high:
+    if usual_range and low <= amplitude <= high:
         guess.note(0.5, "its range is plausible")
-    elif known and unit is not None:
+    elif usual_range and unit is not None:
         guess.note(-1.0, f"its range, {amplitude:.3g} {si}, is unusual")
     return guess
 
@@ -275,16 +275,16 @@ def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns
 def _pair_chambers(guess: Guess, data: Mapping[str, Floats]) -> None:
     """A pressure from those of two chambers: columns whose names differ by A and B, or by 1 and 2, alone."""
     plain = {column: re.sub(r"[^a-z0-9]", "", _simplify_name(column)) for column in data}
-    mine = guess.source
+    source = guess.source
     for column, other in plain.items():
-        pairs = [(a, b) for a, b in zip(plain[mine], other, strict=False) if a != b]
-        if len(other) == len(plain[mine]) and len(pairs) == 1 and "".join(sorted(pairs[0])) in ("ab", "12"):
-            guess.source, guess.minus = (mine, column) if pairs[0][0] < pairs[0][1] else (column, mine)
+        pairs = [(a, b) for a, b in zip(plain[source], other, strict=False) if a != b]
+        if len(other) == len(plain[source]) and len(pairs) == 1 and "".join(sorted(pairs[0])) in ("ab", "12"):
+            guess.source, guess.minus = (source, column) if pairs[0][0] < pairs[0][1] else (column, source)
             guess.note(min(4.0 - guess.points, 0.0), "two chambers: check that the first one extends the ram")
             return
 
 
-def _guess_by_motion(found: dict[str, Guess], columns: Columns, signals: Signals) -> None:
+def _guess_by_motion(guesses: dict[str, Guess], columns: Columns, signals: Signals) -> None:
     """Command and controlled signal where names say nothing: the two free columns that follow each other best.
 
     The later one is the controlled signal. In an open loop the drive takes the place of the command, and the speed that
@@ -292,25 +292,25 @@ def _guess_by_motion(found: dict[str, Guess], columns: Columns, signals: Signals
     """
     is_open, controlled = signals.is_open_loop, signals.controlled
     first = signals.drive if is_open else signals.command
-    data, taken = columns.data, {guess.source for guess in found.values()}
-    known = {s.name: found[s.name] for s in (first, controlled) if s.name in found}
-    firsts, seconds = ([known[s.name].source] if s.name in known else
-                       [c for c in data if c not in taken and (columns.measures(c, s.unit) or not columns.units[c]
-                                                               or columns.has_raw_unit(c, s.unit))]
+    data, sources = columns.data, {guess.source for guess in guesses.values()}
+    known_guesses = {s.name: guesses[s.name] for s in (first, controlled) if s.name in guesses}
+    firsts, seconds = ([known_guesses[s.name].source] if s.name in known_guesses else
+                       [c for c in data if c not in sources and (columns.measures(c, s.unit) or not columns.units[c]
+                                                                 or columns.has_raw_unit(c, s.unit))]
                        for s in (first, controlled))
     pairs = [(abs((correlate_speed if is_open else correlate)(data[a], data[b])), a, b)
              for a in firsts for b in seconds if a != b and len(data[a]) == len(data[b])]
-    if len(known) == 2 or not pairs or max(pairs)[0] <= (LEAST_SPEED_CORRELATION if is_open else 0.9):
+    if len(known_guesses) == 2 or not pairs or max(pairs)[0] <= (LEAST_SPEED_CORRELATION if is_open else 0.9):
         return
     r, a, b = max(pairs)
-    if not known and not is_open and measure_lead(data[a], data[b]) < 0:
+    if not known_guesses and not is_open and measure_lead(data[a], data[b]) < 0:
         a, b = b, a
     for signal, column, other, order in ((first, a, b, "first"), (controlled, b, a, "later")):
-        unit = next((guess.unit for guess in known.values() if guess.unit.si == signal.unit),
+        unit = next((guess.unit for guess in known_guesses.values() if guess.unit.si == signal.unit),
                     UNITS["mm"] if signal.unit == "m" else Unit(signal.unit, signal.unit, Fraction(1)))
-        found.setdefault(signal.name, Guess(column, unit, 1.5, [
+        guesses.setdefault(signal.name, Guess(column, unit, 1.5, [
             f"no name says so; correlation {r:.3f} {'of drive and speed ' if is_open else ''}with {other}"
-            + ("" if known else f", and it comes {order}")]))
+            + ("" if known_guesses else f", and it comes {order}")]))
 
 
 def correlate_speed(drive: Floats, x: Floats) -> float:
@@ -334,19 +334,19 @@ def measure_lead(a: Floats, b: Floats) -> float:
     return abs(correlate(a[:n - shift], b[shift:n])) - abs(correlate(a[shift:n], b[:n - shift]))
 
 
-def _scale_position(found: Mapping[str, Guess], columns: Columns, signals: Signals) -> None:
+def _scale_position(guesses: Mapping[str, Guess], columns: Columns, signals: Signals) -> None:
     """Scale and offset of a position in counts or volts, roughly, from the other position and the drive."""
     command, controlled, drive = signals.command.name, signals.controlled.name, signals.drive.name
     for name, other in ((controlled, command), (command, controlled)):
-        if (not {name, other} <= found.keys()
-                or not columns.has_raw_unit(found[name].source, signals.find(name).unit)
-                or columns.has_raw_unit(found[other].source, signals.find(other).unit)):
+        if (not {name, other} <= guesses.keys()
+                or not columns.has_raw_unit(guesses[name].source, signals.find(name).unit)
+                or columns.has_raw_unit(guesses[other].source, signals.find(other).unit)):
             continue
-        guess, base = found[name], found[other]
+        guess, base = guesses[name], guesses[other]
         raw, x = columns.data[guess.source], columns.data[base.source]
         if len(raw) != len(x) or abs(correlate(raw, x)) < LEAST_SCALING_CORRELATION:
             continue
-        cor = columns.data[found[drive].source] if drive in found else np.zeros(0)
+        cor = columns.data[guesses[drive].source] if drive in guesses else np.zeros(0)
         slope, shift = fit_scale(raw, x, cor if len(cor) == len(x) else np.zeros(len(x)))
         guess.sign, guess.unit, guess.scale = int(np.sign(slope)), base.unit, float(f"{abs(slope):.4g}")
         guess.offset = float(f"{guess.sign * shift:.4g}")
@@ -372,11 +372,11 @@ def fit_scale(raw: Floats, x: Floats, cor: Floats) -> tuple[float, float]:
     return usual, float(x.mean()) - usual * middle
 
 
-def _find_steps(found: Mapping[str, Guess], columns: Columns, signals: Signals) -> None:
+def _find_steps(guesses: Mapping[str, Guess], columns: Columns, signals: Signals) -> None:
     """The step of readings that are whole multiples of it, where its noise counts beside that of the sensor."""
     nominal = load_nominal_values()
     for signal in signals.outputs:
-        guess = found.get(signal.name)
+        guess = guesses.get(signal.name)
         if guess is None or guess.minus or (guess.scale is None and columns.has_raw_unit(guess.source, signal.unit)):
             continue
         comb = find_comb(columns.data[guess.source])
@@ -387,11 +387,11 @@ def _find_steps(found: Mapping[str, Guess], columns: Columns, signals: Signals) 
                 guess.quantum = quantum
 
 
-def _find_signs(found: Mapping[str, Guess], columns: Columns, signals: Signals) -> None:
+def _find_signs(guesses: Mapping[str, Guess], columns: Columns, signals: Signals) -> None:
     """Signs by what a position loop does: position follows command, and the drive has the sign of their difference."""
-    if not {signals.command.name, signals.controlled.name} <= found.keys():
+    if not {signals.command.name, signals.controlled.name} <= guesses.keys():
         return
-    command, controlled = found[signals.command.name], found[signals.controlled.name]
+    command, controlled = guesses[signals.command.name], guesses[signals.controlled.name]
     com, xj = ((1.0 if guess.scale is None else guess.scale) * columns.data[guess.source] + guess.offset
                for guess in (command, controlled))
     com = command.sign * com
@@ -403,7 +403,7 @@ def _find_signs(found: Mapping[str, Guess], columns: Columns, signals: Signals) 
         controlled.note(0.5, f"it follows {command.source} (correlation {r:.3f})")
     else:
         controlled.note(-1.0, f"it hardly follows {command.source} (correlation {r:.2f}): check it")
-    drive = found.get(signals.drive.name)
+    drive = guesses.get(signals.drive.name)
     if drive is not None and len(com) == len(xj):
         error = com * float(command.unit.factor) - controlled.sign * xj * float(controlled.unit.factor)
         r = correlate(columns.data[drive.source], error)
@@ -443,14 +443,14 @@ def _list_signal_lines(signal: Signal, signals: Signals, guess: Guess | None, co
               if guess.quantum else []), ""]
 
 
-def _describe_left(column: str, columns: Columns, found: Mapping[str, Guess], signals: Signals) -> str:
+def _describe_left(column: str, columns: Columns, guesses: Mapping[str, Guess], signals: Signals) -> str:
     """The range of a column that is no signal, or why it is none."""
     if column not in columns.data:
         return "no numbers"
     x = columns.data[column]
     if float(np.ptp(x)) > 0.0:
         return f"{x.min():.4g} .. {x.max():.4g}"
-    rated = [(guess.points, signal.name, signal.symbol) for signal in signals[1:] if signal.name not in found
-             and (guess := _rate_column(signal, signals, column, columns)) is not None]
-    meant = f"; by its name it would be {max(rated)[2]}" if rated else ""
-    return f"always {x[0]:.4g}{meant}"
+    candidates = [(guess.points, signal.name, signal.symbol) for signal in signals[1:] if signal.name not in guesses
+                  and (guess := _rate_column(signal, signals, column, columns)) is not None]
+    hint = f"; by its name it would be {max(candidates)[2]}" if candidates else ""
+    return f"always {x[0]:.4g}{hint}"
