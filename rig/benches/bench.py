@@ -236,8 +236,8 @@ class FrameMap:
     def find(self, identifier: int, data: bytes) -> FrameSpec | None:
         """The frame with this identifier and, if it is multiplexed, with the page of `data`; None: not mapped."""
         for each in self.by_identifier.get(identifier, ()):
-            chosen = each.selector
-            if chosen is None or (len(data) == each.length and extract_bits(chosen, data) == chosen.fixed):
+            selector = each.selector
+            if selector is None or (len(data) == each.length and extract_bits(selector, data) == selector.fixed):
                 return each
         return None
 
@@ -316,8 +316,8 @@ def list_inputs(signals: Signals) -> dict[str, str]:
 
     "" is a number without a unit.
     """
-    given = (signals.command, *signals.outputs, *([signals.load] if signals.load else []))
-    return {s.word: _show_unit(s.unit) for s in given} | dict.fromkeys(RIG_INPUTS, "")
+    inputs = (signals.command, *signals.outputs, *([signals.load] if signals.load else []))
+    return {s.word: _show_unit(s.unit) for s in inputs} | dict.fromkeys(RIG_INPUTS, "")
 
 
 def list_outputs(signals: Signals) -> dict[str, str]:
@@ -330,12 +330,12 @@ def list_measured(signals: Signals) -> tuple[str, ...]:
     return tuple(s.word for s in signals if s.role in ("output", "load"))
 
 
-def find_word(signals: Signals, said: str) -> str:
+def find_word(signals: Signals, name: str) -> str:
     """The word of a signal that is called by it, by its name, or as on every bench: position_demand, load."""
     load = {} if signals.load is None else {"load": signals.load.word}
     words = {s.word: s.word for s in signals[1:]}
     return {"position_demand": signals.command.word, **load, **{s.name: s.word for s in signals[1:]}, **words}.get(
-        said, said)
+        name, name)
 
 
 def _show_unit(unit: str) -> str:
@@ -419,14 +419,14 @@ class Bench:
         """
         if signals == self.signals:
             return replace(self, noise=noise)
-        used = {each.name for spec in self.frames.frames for each in spec.fields}
-        own = {s.word: (s.unit, s.role) for s in signals[1:]}
-        has = ", ".join(f"{word} ({unit})" for word, (unit, _) in own.items())
+        words = {each.name for spec in self.frames.frames for each in spec.fields}
+        new_signals = {s.word: (s.unit, s.role) for s in signals[1:]}
+        signal_list = ", ".join(f"{word} ({unit})" for word, (unit, _) in new_signals.items())
         for s in self.signals[1:]:
-            if s.word in used or s.role in ("command", "drive"):
-                require(own.get(s.word) == (s.unit, s.role), self.name, s.word,
-                        f"a plant that has this signal, as {s.role} in {s.unit}; {model} has {has}; another bench by "
-                        "--bench FILE")
+            if s.word in words or s.role in ("command", "drive"):
+                require(new_signals.get(s.word) == (s.unit, s.role), self.name, s.word,
+                        f"a plant that has this signal, as {s.role} in {s.unit}; {model} has {signal_list}; another "
+                        "bench by --bench FILE")
         return replace(self, signals=signals, noise=noise)
 
     @property
@@ -453,8 +453,8 @@ class Bench:
     @property
     def rig_node(self) -> int:
         """Node-ID of the rig: 1, or the largest that is free if a device has that."""
-        taken = {node.node for node in self.nodes.values()}
-        return 1 if 1 not in taken else next(number for number in range(127, 0, -1) if number not in taken)
+        node_ids = {node.node for node in self.nodes.values()}
+        return 1 if 1 not in node_ids else next(number for number in range(127, 0, -1) if number not in node_ids)
 
     def find_number(self, role: Role) -> int:
         """The node-ID of a participant; on plain CAN, where nobody has one, the number of its role."""
@@ -496,12 +496,12 @@ class Bench:
     def list_services(self) -> dict[int, str]:
         """Identifiers that carry no values of the bench, and what they are: NMT, SYNC, and the services of the nodes.
         """
-        found = {} if self.frames.sync is None else {self.frames.sync: "SYNC"}
+        services = {} if self.frames.sync is None else {self.frames.sync: "SYNC"}
         if self.nodes:
-            found[0x000] = "NMT"
+            services[0x000] = "NMT"
             for number in (self.rig_node, *(node.node for node in self.nodes.values())):
-                found |= {base + number: f"{service} of node {number}" for base, service in SERVICES.items()}
-        return found
+                services |= {base + number: f"{service} of node {number}" for base, service in SERVICES.items()}
+        return services
 
 
 def decode_device_text(data: bytes) -> str:

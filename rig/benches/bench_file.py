@@ -141,19 +141,19 @@ def load_bench(name_or_path: str = "eha", *, is_trusted: bool = False) -> Bench:
     Raises:
         InputError: no such bench, or the file, line and key that cannot be used and what was expected there.
     """
-    shipped = list_benches()
-    if name_or_path in shipped:
+    benches = list_benches()
+    if name_or_path in benches:
         return _load_shipped(name_or_path)
     path = Path(name_or_path)
-    require(path.suffix == ".toml", name_or_path, "", f"a .toml file, or {list_choices(name_or_path, shipped)}")
+    require(path.suffix == ".toml", name_or_path, "", f"a .toml file, or {list_choices(name_or_path, benches)}")
     return _parse_bench(str(path), read_file(path), lambda name: read_file(path.parent / name), path.parent,
                         is_trusted=is_trusted)
 
 
 def list_benches() -> dict[str, str]:
     """The benches that come with the rig: name and title."""
-    found = sorted(Path(entry.name).stem for entry in files("rig.benches").iterdir() if entry.name.endswith(".toml"))
-    return {name: _load_shipped(name).name for name in found}
+    names = sorted(Path(entry.name).stem for entry in files("rig.benches").iterdir() if entry.name.endswith(".toml"))
+    return {name: _load_shipped(name).name for name in names}
 
 
 @cache
@@ -285,13 +285,13 @@ def _refuse_canopen_keys(keys: BenchKeys, place: Place) -> None:
 
 def _find_plant(reader: _Reader, folder: Path, *, is_trusted: bool) -> tuple[str, str]:
     """The model of a bench file, and what models call its plant; a Python file runs, if the user trusts it."""
-    named, place = reader.keys.plant, reader.place.at("plant")
-    path = folder / named if Path(named).suffix and (folder / named).is_file() else Path(named)
+    model, place = reader.keys.plant, reader.place.at("plant")
+    path = folder / model if Path(model).suffix and (folder / model).is_file() else Path(model)
     if path.suffix == ".py":
-        content = reader.read_file(named, place)
-        reader.files.pop(named)  # a log has it as the plant of the run
+        content = reader.read_file(model, place)
+        reader.files.pop(model)  # a log has it as the plant of the run
         if not is_loaded(path, content):  # a user who names it himself trusts it
-            require_trust(place.file, [ForeignCode(named, content)], is_trusted=is_trusted)
+            require_trust(place.file, [ForeignCode(model, content)], is_trusted=is_trusted)
         load_plant(path, content)
     else:
         load_plant_of_model(path, is_trusted=is_trusted)
@@ -307,22 +307,24 @@ def _list_uses(keys: NodeKeys, place: Place, signals: Signals, *, is_canopen: bo
     """
     uses: dict[str, Use] = {}
     inputs, outputs = list_inputs(signals), list_outputs(signals)
-    needed = {signals.drive.word, *list_measured(signals)}
-    for table, known, is_received in (("inputs", outputs if is_plant else inputs, True),
+    needed_signals = {signals.drive.word, *list_measured(signals)}
+    for table, units, is_received in (("inputs", outputs if is_plant else inputs, True),
                                       ("outputs", inputs if is_plant else outputs, False)):
-        for named, entry in _group_keys(getattr(keys, table), 0).items():
-            own, signal = place.at(table, named), find_word(signals, named)
-            own.require(signal in known, f"a signal of the bench and its plant: {list_choices(named, known)}")
+        for entry_name, entry in _group_keys(getattr(keys, table), 0).items():
+            entry_place, signal = place.at(table, entry_name), find_word(signals, entry_name)
+            entry_place.require(signal in units,
+                                f"a signal of the bench and its plant: {list_choices(entry_name, units)}")
             word = "object" if is_canopen else "signal"
-            said = build_dataclass(SignalKeys, {word if key == "" else key: text for key, text in entry.items()}, own)
-            name = said.object if is_canopen else said.signal
-            if name is None or (said.signal if is_canopen else said.object) is not None:
-                raise own.refuse(f"a table with {word} = " + ('"0x607A"' if is_canopen else '"MESSAGE.SIGNAL"'))
-            count, offset = (None if text is None else parse_quantity(text, known[signal], own.at(key))
-                             for key, text in (("count", said.count), ("offset", said.offset)))
-            own.at("count").require(count != 0, "a number other than 0")
-            use = Use(place=own, is_received=is_received, signal=signal, unit=known[signal], count=count, offset=offset,
-                      is_needed=signal in needed)
+            signal_keys = build_dataclass(
+                SignalKeys, {word if key == "" else key: text for key, text in entry.items()}, entry_place)
+            name = signal_keys.object if is_canopen else signal_keys.signal
+            if name is None or (signal_keys.signal if is_canopen else signal_keys.object) is not None:
+                raise entry_place.refuse(f"a table with {word} = " + ('"0x607A"' if is_canopen else '"MESSAGE.SIGNAL"'))
+            count, offset = (None if text is None else parse_quantity(text, units[signal], entry_place.at(key))
+                             for key, text in (("count", signal_keys.count), ("offset", signal_keys.offset)))
+            entry_place.at("count").require(count != 0, "a number other than 0")
+            use = Use(place=entry_place, is_received=is_received, signal=signal, unit=units[signal], count=count,
+                      offset=offset, is_needed=signal in needed_signals)
             _add_use(uses, name, use, is_canopen=is_canopen)
     return uses
 
@@ -333,21 +335,21 @@ def _group_keys(flat: Mapping[str, Any], dots: int) -> dict[str, dict[str, Any]]
     >>> _group_keys({"Demand.Enable.main": 1, "Demand.Crc": "crc8"}, 1)
     {'Demand.Enable': {'main': 1}, 'Demand.Crc': {'': 'crc8'}}
     """
-    grouped: dict[str, dict[str, Any]] = {}
+    groups: dict[str, dict[str, Any]] = {}
     for full, value in flat.items():
         parts = full.split(".")
-        grouped.setdefault(".".join(parts[:dots + 1]), {})[".".join(parts[dots + 1:])] = value
-    return grouped
+        groups.setdefault(".".join(parts[:dots + 1]), {})[".".join(parts[dots + 1:])] = value
+    return groups
 
 
 def _add_use(uses: dict[str, Use], name: str, use: Use, *, is_canopen: bool) -> None:
     """Add a use, once for each object or signal."""
     key = name
     if is_canopen:
-        found = canopen_map.parse_object(name)
-        if found is None:
+        indices = canopen_map.parse_object(name)
+        if indices is None:
             raise use.place.refuse(f"an object such as 0x2110:1, not {name!r}")
-        key = canopen_map.name_object(*found)
+        key = canopen_map.name_object(*indices)
     if key in uses:
         raise use.place.refuse(f"each value of the device once; {key} is {uses[key].place.keys} already")
     uses[key] = use
@@ -357,22 +359,23 @@ def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, pla
     """Add the values of [phases], [ready] and [protection]."""
     dots = 0 if is_canopen else 1
     for name, values in _group_keys(keys.phases, dots).items():
-        own = place.at("phases", name)
+        entry_place = place.at("phases", name)
         for phase in values:
-            own.require(phase in PHASES, f"values by phase: {list_choices(phase or None, PHASES)}")
-        _add_use(uses, name, Use(place=own, is_received=True, values=values), is_canopen=is_canopen)
+            entry_place.require(phase in PHASES, f"values by phase: {list_choices(phase or None, PHASES)}")
+        _add_use(uses, name, Use(place=entry_place, is_received=True, values=values), is_canopen=is_canopen)
     for name, value in keys.ready.items():
         use = Use(place=place.at("ready", name), is_received=False, values={"main": value})
         _add_use(uses, name, use, is_canopen=is_canopen)
     for name, entry in _group_keys(keys.protection, dots).items():
-        own = place.at("protection", name)
-        said = build_dataclass(ProtectionKeys, {key or "kind": list(value) if isinstance(value, tuple) else value
-                                                for key, value in entry.items()}, own)
-        own.at("data_id").require(said.kind != "counter" or said.data_id is None, "a checksum with it")
-        use = Use(place=own, is_received=None, guard=Guard.COUNTER)
-        if said.kind != "counter":
-            checksum = reader.find_checksum(said.kind, own)
-            use = _set_data_id(replace(use, guard=Guard.CHECKSUM, checksum=checksum), said.data_id)
+        entry_place = place.at("protection", name)
+        protection = build_dataclass(ProtectionKeys, {key or "kind": list(value) if isinstance(value, tuple) else value
+                                                      for key, value in entry.items()}, entry_place)
+        entry_place.at("data_id").require(protection.kind != "counter" or protection.data_id is None,
+                                          "a checksum with it")
+        use = Use(place=entry_place, is_received=None, guard=Guard.COUNTER)
+        if protection.kind != "counter":
+            checksum = reader.find_checksum(protection.kind, entry_place)
+            use = _set_data_id(replace(use, guard=Guard.CHECKSUM, checksum=checksum), protection.data_id)
         _add_use(uses, name, use, is_canopen=is_canopen)
 
 
@@ -390,10 +393,10 @@ def _set_data_id(use: Use, data_id: int | tuple[int, ...] | None) -> Use:
 
 def _check_signals(uses: Mapping[str, Use], inputs: tuple[str, ...], outputs: tuple[str, ...], place: Place) -> None:
     """Refuse a device without the signals that every run needs."""
-    for table, needed, is_received in (("inputs", inputs, True), ("outputs", outputs, False)):
-        known = {use.signal for use in uses.values() if use.is_received is is_received}
-        for signal in needed:
-            place.at(table).require(signal in known, f"also the signal {signal}")
+    for table, signals, is_received in (("inputs", inputs, True), ("outputs", outputs, False)):
+        device_signals = {use.signal for use in uses.values() if use.is_received is is_received}
+        for signal in signals:
+            place.at(table).require(signal in device_signals, f"also the signal {signal}")
 
 
 def _list_states(frames: list[DeviceFrame], uses: Mapping[str, Use],
@@ -438,54 +441,54 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
 
 def _list_objects(frames: list[DeviceFrame], uses: Mapping[str, Use], *, is_received: bool) -> dict[str, SignalObject]:
     """The objects of a node by the signal that they hold."""
-    found = {}
+    objects = {}
     for frame in (each for each in frames if each.is_received is is_received):
         fields = {each.lowest: each for each in build_fields(frame, uses)}
         for slot in frame.slots:
             use, key = uses.get(slot.name), canopen_map.parse_object(slot.name)
             if use is not None and use.signal and key is not None:
-                found[use.signal] = SignalObject(key, fields[slot.bits.lowest])
-    return found
+                objects[use.signal] = SignalObject(key, fields[slot.bits.lowest])
+    return objects
 
 
 def _add_profile(uses: dict[str, Use], dictionary: Any, keys: ControllerKeys, place: Place) -> None:
     """Add the objects that the profile gives a meaning; its modes only where a PDO maps them."""
-    named = {(use.signal, use.is_received) for use in uses.values()}
+    used_signals = {(use.signal, use.is_received) for use in uses.values()}
     for signal, (key, is_received) in _PROFILE_OBJECTS[keys.profile].items():
         is_optional = signal.startswith("mode") and not canopen_map.is_mapped(dictionary, key, is_received=is_received)
-        if key not in uses and (signal, is_received) not in named and not is_optional:
+        if key not in uses and (signal, is_received) not in used_signals and not is_optional:
             uses[key] = Use(place=place.at("profile"), is_received=is_received, signal=signal)
 
 
 def _find_writable(dictionary: Any, key: str, place: Place) -> Any:
     """The object of the EDS that a key such as 0x2110:1 names, which can be written."""
     index, sub = canopen_map.parse_object(key) or (0, 0)
-    found = canopen_map.find_variable(dictionary, index, sub)
-    if found is None or not found.writable:
+    variable = canopen_map.find_variable(dictionary, index, sub)
+    if variable is None or not variable.writable:
         raise place.refuse("an object of the EDS that can be written, such as 0x2110:1")
-    return found
+    return variable
 
 
 def _list_values(dictionary: Any, values: Mapping[str, float], place: Place) -> Iterator[tuple[int, int, bytes]]:
     """Objects that are written at bring-up, after those of a DCF."""
     for key, value in values.items():
-        found = _find_writable(dictionary, key, place.at(key))
-        data = canopen_map.encode_value(found, value)
+        variable = _find_writable(dictionary, key, place.at(key))
+        data = canopen_map.encode_value(variable, value)
         if data is None:
-            raise place.at(key).refuse(f"a number that {found.name} can hold, not {value:g}")
-        yield found.index, found.subindex, data
+            raise place.at(key).refuse(f"a number that {variable.name} can hold, not {value:g}")
+        yield variable.index, variable.subindex, data
 
 
 def _list_settings(plant: str, dictionary: Any, parameters: Mapping[str, str],
                    place: Place) -> Iterator[tuple[int, int, str]]:
     """Objects that hold parameters of the model."""
     for name, parameter in parameters.items():
-        own = place.at(name)
-        found = _find_writable(dictionary, name, own)
+        entry_place = place.at(name)
+        variable = _find_writable(dictionary, name, entry_place)
         if is_known(plant):
-            with own.locate():
+            with entry_place.locate():
                 find_quantity(parameter, "", plant)
-        yield found.index, found.subindex, parameter
+        yield variable.index, variable.subindex, parameter
 
 
 def _build_spec(frame: DeviceFrame, uses: Mapping[str, Use], signals: Signals) -> FrameSpec:
@@ -508,46 +511,47 @@ def _join_plant_node(reader: _Reader, specs: list[FrameSpec], sync: int | None, 
     place.at("node").require(node.node != nodes[Role.CONTROLLER].node,
                              f"a node-ID other than {node.node}, which the controller has")
     place.at("eds").require(own_sync == sync, "the controller's identifier of SYNC in 0x1005")
-    joined = {spec.identifier: spec for spec in specs}
+    by_identifier = {spec.identifier: spec for spec in specs}
     for frame in frames:
-        own = replace(frame.spec, name=f"plant {frame.spec.name}", sender=Role.PLANT, fields=build_fields(frame, uses),
-                      roles=("valve_state",))
-        other = joined.get(own.identifier)
-        place.at("inputs").require(other is not None or not frame.is_received,
+        plant_spec = replace(frame.spec, name=f"plant {frame.spec.name}", sender=Role.PLANT,
+                             fields=build_fields(frame, uses), roles=("valve_state",))
+        controller_spec = by_identifier.get(plant_spec.identifier)
+        place.at("inputs").require(controller_spec is not None or not frame.is_received,
                                    f"a frame of the controller; it has none with the COB-ID of {frame.spec.name}, "
-                                   f"{describe_identifier(own.identifier)}")
-        if other is not None:
-            own = _join_frame(other, own, frame, place)
-        joined[own.identifier] = own
-    return list(joined.values()), node
+                                   f"{describe_identifier(plant_spec.identifier)}")
+        if controller_spec is not None:
+            plant_spec = _join_frame(controller_spec, plant_spec, frame, place)
+        by_identifier[plant_spec.identifier] = plant_spec
+    return list(by_identifier.values()), node
 
 
-def _join_frame(other: FrameSpec, own: FrameSpec, frame: DeviceFrame, place: Place) -> FrameSpec:
-    """The frame that the controller has as `other` and the plant node as `own`."""
-    place.at("outputs").require(frame.is_received or other.sender is not Role.CONTROLLER,
+def _join_frame(controller_spec: FrameSpec, plant_spec: FrameSpec, frame: DeviceFrame, place: Place) -> FrameSpec:
+    """The frame that the controller has as `controller_spec` and the plant node as `plant_spec`."""
+    place.at("outputs").require(frame.is_received or controller_spec.sender is not Role.CONTROLLER,
                                 f"COB-IDs that the controller does not send; {frame.spec.name} has "
-                                f"{describe_identifier(own.identifier)} too")
-    pairs = list(zip(other.fields, own.fields, strict=False))
-    is_alike = len(other.fields) == len(own.fields) and all(
-        (theirs.lowest, theirs.length) == (ours.lowest, ours.length)
-        and (theirs == ours or not theirs.name or not ours.name) for theirs, ours in pairs)
-    place.at("eds").require(is_alike and other.length == own.length,
-                            f"the layout and counts of the controller's {other.name} in {frame.spec.name}, "
-                            f"{describe_identifier(own.identifier)}")
-    joined = replace(other, fields=tuple(theirs if theirs.name else ours for theirs, ours in pairs))
+                                f"{describe_identifier(plant_spec.identifier)} too")
+    pairs = list(zip(controller_spec.fields, plant_spec.fields, strict=False))
+    is_alike = len(controller_spec.fields) == len(plant_spec.fields) and all(
+        (first.lowest, first.length) == (second.lowest, second.length)
+        and (first == second or not first.name or not second.name) for first, second in pairs)
+    place.at("eds").require(is_alike and controller_spec.length == plant_spec.length,
+                            f"the layout and counts of the controller's {controller_spec.name} in {frame.spec.name}, "
+                            f"{describe_identifier(plant_spec.identifier)}")
+    spec = replace(controller_spec, fields=tuple(first if first.name else second for first, second in pairs))
     if frame.is_received:
-        return joined
-    return replace(joined, sender=Role.PLANT, every=own.every, is_answer=own.is_answer, is_before_sync=False)
+        return spec
+    return replace(spec, sender=Role.PLANT, every=plant_spec.every, is_answer=plant_spec.is_answer,
+                   is_before_sync=False)
 
 
 def _check_identifiers(bench: Bench, place: Place) -> None:
     """Refuse an identifier that two frames have, or a frame and a service of a node."""
-    taken = bench.list_services()
+    owners = bench.list_services()
     for spec in bench.frames.frames:
         identifier = spec.identifier & ~FD
         message = spec.name.partition("[")[0]  # its pages share the identifier
-        place.at("controller").require(taken.setdefault(identifier, message) == message,
-                                       f"each identifier once; {spec.name} and {taken[identifier]} have "
+        place.at("controller").require(owners.setdefault(identifier, message) == message,
+                                       f"each identifier once; {spec.name} and {owners[identifier]} have "
                                        f"{describe_identifier(identifier)}")
 
 
@@ -566,10 +570,10 @@ def make_plant_bench(plant: Plant, model: str) -> Bench:
     """
     name, cycle = Path(model).name, f"{1e6 * plant.nominal['controller.period']:.12g} us"
     _read_time(cycle, Place(name).at("controller", "period"), *_CYCLES)
-    given = {"title": plant.title, "model": name, "cycle": cycle, "dbc": _PLANT_DBC, "drive": plant.signals.drive,
-             "sent": (plant.signals.command, *plant.signals.outputs)}
-    return load_bench_from_files({_PLANT_BENCH: fill_template("benches/plant_bench.jinja", **given).encode(),
-                                  _PLANT_DBC: fill_template("benches/plant_dbc.jinja", **given).encode()},
+    context = {"title": plant.title, "model": name, "cycle": cycle, "dbc": _PLANT_DBC, "drive": plant.signals.drive,
+               "sent": (plant.signals.command, *plant.signals.outputs)}
+    return load_bench_from_files({_PLANT_BENCH: fill_template("benches/plant_bench.jinja", **context).encode(),
+                                  _PLANT_DBC: fill_template("benches/plant_dbc.jinja", **context).encode()},
                                  plant.signals)
 
 

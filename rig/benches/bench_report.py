@@ -31,9 +31,9 @@ def count_bits(identifier: int, length: int) -> int:
     >>> count_bits(0x182, 8), count_bits(0x80, 0)
     (135, 55)
     """
-    stuffed = 54 if identifier & EXTENDED else 34  # bits of a classical frame beside the data that stuffing may extend
+    stuffed_bits = 54 if identifier & EXTENDED else 34  # of a classical frame beside the data that stuffing may extend
     if not identifier & FD:
-        return stuffed + 8 * length + 13 + (stuffed + 8 * length - 1) // 4
+        return stuffed_bits + 8 * length + 13 + (stuffed_bits + 8 * length - 1) // 4
     head = (41 if identifier & EXTENDED else 22) + 8 * length
     checksum = 4 + (17 if length <= 16 else 21)  # stuff count and CRC, with a stuff bit before each four bits
     return head + (head - 1) // 4 + checksum + -(-checksum // 4) + 13
@@ -62,13 +62,13 @@ def list_loads(bench: Bench) -> list[FrameLoad]:
     pages = Counter(spec.sent_as for spec in bench.frames.frames if spec.sender is not Role.RIG)
     sync = [] if bench.frames.sync is None else [("SYNC", bench.frames.sync, "rig > all", 0, (), cycle)]
     nodes = {Role.RIG: bench.rig_node, **{role: each.node for role, each in bench.nodes.items()}} if bench.nodes else {}
-    found = [*((spec.name, spec.sent_as, _describe_direction(bench, spec), spec.length, list_content(spec),
-                cycle * spec.every) for spec in bench.frames.frames), *sync,
-             *((f"heartbeat {node}", 0x700 + node, f"{role.name.lower()} > all", 1, (), HEARTBEAT)
-               for role, node in sorted(nodes.items()))]
+    rows = [*((spec.name, spec.sent_as, _describe_direction(bench, spec), spec.length, list_content(spec),
+               cycle * spec.every) for spec in bench.frames.frames), *sync,
+            *((f"heartbeat {node}", 0x700 + node, f"{role.name.lower()} > all", 1, (), HEARTBEAT)
+              for role, node in sorted(nodes.items()))]
     return [FrameLoad(*each, share=compute_time(each[1], each[3], bench.bitrate, bench.data_bitrate) / each[5]
                       / max(pages[each[1]], 1))
-            for each in found]
+            for each in rows]
 
 
 def _describe_direction(bench: Bench, spec: FrameSpec) -> str:

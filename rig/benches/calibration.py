@@ -76,28 +76,30 @@ def read_calibration(tables: Mapping[str, Mapping[str, Any]], place: Place,
     Raises:
         InputError: a signal that no sensor measures, a text that is no date, a u without its unit.
     """
-    sensed = {word: s for s in signals if s.role in ("output", "load") for word in (s.alias, s.name) if word}
+    signals_by_word = {word: s for s in signals if s.role in ("output", "load") for word in (s.alias, s.name) if word}
     decision: Decision = "simple"
-    found: dict[str, SensorCalibration] = {}
+    calibrations: dict[str, SensorCalibration] = {}
     for word, table in tables.items():
-        own = place.at(word)
+        entry_place = place.at(word)
         if word == "decision":
-            own.require(table.get("") in DECISIONS, list_choices(table.get(""), DECISIONS))
+            entry_place.require(table.get("") in DECISIONS, list_choices(table.get(""), DECISIONS))
             decision = table[""]
             continue
-        own.require(word in sensed, f"decision or a measured signal: {list_choices(word, sensed)}")
-        signal = sensed[word]
-        own.require(signal.name not in found, f"each signal once; {signal.name} and {signal.alias} are the same")
+        entry_place.require(word in signals_by_word,
+                            f"decision or a measured signal: {list_choices(word, signals_by_word)}")
+        signal = signals_by_word[word]
+        entry_place.require(signal.name not in calibrations,
+                            f"each signal once; {signal.name} and {signal.alias} are the same")
         keys = build_dataclass(SensorKeys, {key: str(value) if isinstance(value, datetime.date) else value
-                                            for key, value in table.items()}, own)
-        first, last = (_read_date(getattr(keys, key), own.at(key)) for key in ("date", "expiry"))
-        own.at("expiry").require(last >= first, f"a date from {first} on, not {last}")
+                                            for key, value in table.items()}, entry_place)
+        first, last = (_read_date(getattr(keys, key), entry_place.at(key)) for key in ("date", "expiry"))
+        entry_place.at("expiry").require(last >= first, f"a date from {first} on, not {last}")
         distribution, half_width = _split_distribution(keys.u)
-        u = _read_size(half_width, signal.unit, own.at("u")) / WIDTHS[distribution]
-        noise = 0.0 if keys.noise is None else _read_size(keys.noise, signal.unit, own.at("noise"))
-        found[signal.name] = SensorCalibration(signal.name, signal.unit, keys.identifier, first, last, u, distribution,
-                                               keys.gain, noise)
-    return decision, found
+        u = _read_size(half_width, signal.unit, entry_place.at("u")) / WIDTHS[distribution]
+        noise = 0.0 if keys.noise is None else _read_size(keys.noise, signal.unit, entry_place.at("noise"))
+        calibrations[signal.name] = SensorCalibration(signal.name, signal.unit, keys.identifier, first, last, u,
+                                                      distribution, keys.gain, noise)
+    return decision, calibrations
 
 
 def _read_date(text: str, place: Place) -> datetime.date:

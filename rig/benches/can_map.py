@@ -40,19 +40,21 @@ def map_messages(name: str, database: Any, uses: Mapping[str, Use], cycle_ns: in
         InputError: a message or signal that the DBC lacks, or one that cannot be sent as the bench file wants.
     """
     messages = {message.name: message for message in database.messages}
-    grouped: dict[str, dict[str, Use]] = {}
+    uses_by_message: dict[str, dict[str, Use]] = {}
     for full, use in uses.items():
         message, _, signal = full.partition(".")
         if message not in messages or not signal:
             raise use.place.refuse(f"MESSAGE.SIGNAL of {name}, not {full!r}{suggest_name(message, messages)}")
         use.place.require(sum(each.name == message for each in database.messages) == 1,
                           f"one message {message}; {name} has several")
-        known = {each.name for each in messages[message].signals}
-        use.place.require(signal in known, f"a signal of message {message}: {list_choices(signal, known)}")
-        grouped.setdefault(message, {})[full] = use
-    switched = _find_switched(database)
-    return [frame for message, own in grouped.items()
-            for frame in _map_message(name, messages[message], own, cycle_ns, is_switched=message in switched)]
+        signal_names = {each.name for each in messages[message].signals}
+        use.place.require(signal in signal_names,
+                          f"a signal of message {message}: {list_choices(signal, signal_names)}")
+        uses_by_message.setdefault(message, {})[full] = use
+    brs_names = _find_switched(database)
+    return [frame for message, message_uses in uses_by_message.items()
+            for frame in _map_message(name, messages[message], message_uses, cycle_ns,
+                                      is_switched=message in brs_names)]
 
 
 def _find_switched(database: Any) -> set[str]:
@@ -61,14 +63,14 @@ def _find_switched(database: Any) -> set[str]:
     definition = None if specifics is None else specifics.attribute_definitions.get("CANFD_BRS")
     if definition is None:
         return set()
-    names, found = [str(each) for each in definition.choices or ()], set()
+    names, brs_names = [str(each) for each in definition.choices or ()], set()
     for message in database.messages:
-        given = message.dbc.attributes.get("CANFD_BRS") if message.dbc is not None else None
-        value = definition.default_value if given is None else given.value
-        is_place = given is not None and isinstance(value, int) and 0 <= value < len(names)
+        attribute = message.dbc.attributes.get("CANFD_BRS") if message.dbc is not None else None
+        value = definition.default_value if attribute is None else attribute.value
+        is_place = attribute is not None and isinstance(value, int) and 0 <= value < len(names)
         if (names[int(value)] if is_place else str(value)) == "1":
-            found.add(message.name)
-    return found
+            brs_names.add(message.name)
+    return brs_names
 
 
 def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns: int, *, is_switched: bool
@@ -76,18 +78,18 @@ def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns:
     ways = {use.is_received for use in uses.values()} - {None}
     place = next(iter(uses.values())).place
     if len(ways) != 1:
-        expected = "in one direction" if ways else "that other tables of this file use"
-        raise place.refuse(f"signals of a message {expected}; {message.name} has {', '.join(uses)}")
+        expectation = "in one direction" if ways else "that other tables of this file use"
+        raise place.refuse(f"signals of a message {expectation}; {message.name} has {', '.join(uses)}")
     require(message.length in _FD_LENGTHS, name, message.name,
             f"a length of a CAN frame, 0 to 8 bytes (CAN FD also 12, 16, 20, 24, 32, 48, 64), not {message.length}")
     is_fd = message.is_fd or message.length > 8
     identifier = message.frame_id | (EXTENDED if message.is_extended_frame else 0) | (FD if is_fd else 0)
     slots = {signal.name: _read_slot(name, message, signal) for signal in message.signals}
-    chosen = [signal for signal in message.signals if f"{message.name}.{signal.name}" in uses]
-    selector = _find_selector(message, chosen, place)
-    if (own := f"{message.name}.{selector}") in uses:
-        raise uses[own].place.refuse(f"signals with no other use; {own} is the multiplexer of used ones")
-    pages = _list_pages(message, chosen, selector, is_received=True in ways)
+    used_signals = [signal for signal in message.signals if f"{message.name}.{signal.name}" in uses]
+    selector = _find_selector(message, used_signals, place)
+    if (full_name := f"{message.name}.{selector}") in uses:
+        raise uses[full_name].place.refuse(f"signals with no other use; {full_name} is the multiplexer of used ones")
+    pages = _list_pages(message, used_signals, selector, is_received=True in ways)
     for page in pages:
         on_page = [replace(slots[signal.name], start=page, is_selector=True) if signal.name == selector else
                    slots[signal.name] for signal in message.signals if _is_on_page(message, signal, selector, page)]
@@ -99,24 +101,24 @@ def _map_message(name: str, message: Message, uses: Mapping[str, Use], cycle_ns:
             is_answer=True in ways or is_needed or (len(pages) == 1 and bool(message.cycle_time))))
 
 
-def _find_selector(message: Message, chosen: list[Signal], place: Place) -> str:
+def _find_selector(message: Message, used_signals: list[Signal], place: Place) -> str:
     """The multiplexer of the used signals, "" where there is none; several, or nested ones, are refused."""
-    found = {str(signal.multiplexer_signal) for signal in chosen if signal.multiplexer_signal}
-    outer = {signal.name for signal in message.signals if signal.name in found and signal.multiplexer_signal}
-    place.require(len(found) <= 1 and not outer,
-                  f"signals of one multiplexer; {message.name} has {' and '.join(sorted(found))}"
+    multiplexers = {str(signal.multiplexer_signal) for signal in used_signals if signal.multiplexer_signal}
+    outer = {signal.name for signal in message.signals if signal.name in multiplexers and signal.multiplexer_signal}
+    place.require(len(multiplexers) <= 1 and not outer,
+                  f"signals of one multiplexer; {message.name} has {' and '.join(sorted(multiplexers))}"
                   f"{', a nested one' if outer else ''}")
-    return next(iter(found), "")
+    return next(iter(multiplexers), "")
 
 
-def _list_pages(message: Message, chosen: list[Signal], selector: str, *, is_received: bool) -> list[int]:
+def _list_pages(message: Message, used_signals: list[Signal], selector: str, *, is_received: bool) -> list[int]:
     """The values of the selector with a used signal; of a message that the device sends also the others on which one
     stands. Without a selector there is one page.
     """
-    stands_beside = not is_received and any(not signal.multiplexer_signal for signal in chosen)
-    found = {number for signal in (message.signals if stands_beside else chosen)
+    stands_beside = not is_received and any(not signal.multiplexer_signal for signal in used_signals)
+    pages = {number for signal in (message.signals if stands_beside else used_signals)
              if selector and signal.multiplexer_signal == selector for number in signal.multiplexer_ids or ()}
-    return sorted(found)[:MOST_FRAMES + 1] if selector else [0]
+    return sorted(pages)[:MOST_FRAMES + 1] if selector else [0]
 
 
 def _is_on_page(message: Message, signal: Signal, selector: str, page: int) -> bool:
@@ -127,10 +129,10 @@ def _is_on_page(message: Message, signal: Signal, selector: str, page: int) -> b
 
 
 def _find_period(name: str, message: Message, cycle_ns: int) -> int:
-    given = _read_number(name, f"{message.name} GenMsgCycleTime", message.cycle_time)
-    period = given * 1_000_000 / cycle_ns
+    cycle_time = _read_number(name, f"{message.name} GenMsgCycleTime", message.cycle_time)
+    period = cycle_time * 1_000_000 / cycle_ns
     require(period.denominator == 1 and 0 <= period < 1_000_000, name, message.name,
-            f"a GenMsgCycleTime that is a multiple of the cycle, {cycle_ns / 1e6:g} ms, not {float(given):g} ms")
+            f"a GenMsgCycleTime that is a multiple of the cycle, {cycle_ns / 1e6:g} ms, not {float(cycle_time):g} ms")
     return int(period) or 1
 
 

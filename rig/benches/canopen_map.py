@@ -52,12 +52,12 @@ def parse_object(text: str) -> tuple[int, int] | None:
     >>> parse_object("0x2110:1"), parse_object("0x6040"), parse_object("2100")
     ((8464, 1), (24640, 0), None)
     """
-    found = _OBJECT.fullmatch(text.strip())
-    if found is None:
+    match = _OBJECT.fullmatch(text.strip())
+    if match is None:
         return None
-    sub = found[2] or "0"
+    sub = match[2] or "0"
     number = int(sub, 16) if sub.startswith("0x") else int(sub)
-    return (int(found[1], 16), number) if number < 256 else None
+    return (int(match[1], 16), number) if number < 256 else None
 
 
 def name_object(index: int, sub: int) -> str:
@@ -79,9 +79,9 @@ def read_dictionary(name: str, text: str, node: int) -> Any:
     with use_reader("canopen", name, "an electronic data sheet (CiA 306): {}"):  # it warns of what no bench uses
         dictionary: Any = import_eds(io.StringIO(text), node)  # type: ignore[no-untyped-call]
     require(any(index >= 0x1000 for index in dictionary), name, "", "an electronic data sheet (CiA 306) with objects")
-    own = read_node(text)
-    require(own in (None, node), name, "NodeID", f"{node}, the node of the bench file, not {own}")
-    if own is None and not name.lower().endswith(".dcf"):
+    file_node = read_node(text)
+    require(file_node in (None, node), name, "NodeID", f"{node}, the node of the bench file, not {file_node}")
+    if file_node is None and not name.lower().endswith(".dcf"):
         for variable in list_variables(dictionary):
             variable.value = None  # in an EDS it is a slip of its tool: the device is not to be configured so
     return dictionary
@@ -89,9 +89,9 @@ def read_dictionary(name: str, text: str, node: int) -> Any:
 
 def read_node(text: str) -> int | None:
     """The node-ID that a DCF is for; None of an EDS."""
-    found = re.search(r"^\[DeviceComm?issioning\][^\[]*^NodeID\s*=\s*(0x[0-9A-Fa-f]{1,2}|[1-9]\d{0,2})\s*$", text,
+    match = re.search(r"^\[DeviceComm?issioning\][^\[]*^NodeID\s*=\s*(0x[0-9A-Fa-f]{1,2}|[1-9]\d{0,2})\s*$", text,
                       re.MULTILINE | re.IGNORECASE)
-    return None if found is None else int(found[1], 0)
+    return None if match is None else int(match[1], 0)
 
 
 def find_variable(dictionary: Any, index: int, sub: int) -> ODVariable | None:
@@ -100,23 +100,23 @@ def find_variable(dictionary: Any, index: int, sub: int) -> ODVariable | None:
     if item is None or isinstance(item, ODVariable):
         return item if not sub else None
     is_compact = sub not in item.subindices and read_number(dictionary, index, 0) is None  # it lists no elements
-    found: ODVariable | None = (item if is_compact else item.subindices).get(sub)
-    return found
+    variable: ODVariable | None = (item if is_compact else item.subindices).get(sub)
+    return variable
 
 
 def read_number(dictionary: Any, index: int, sub: int) -> int | None:
     """The whole number that the device holds after a reset, or that the DCF writes; None if the file gives none."""
     item = dictionary.get(index)
-    found = item if isinstance(item, ODVariable) else getattr(item, "subindices", {}).get(sub)
-    value = _find_value(found)
+    variable = item if isinstance(item, ODVariable) else getattr(item, "subindices", {}).get(sub)
+    value = _find_value(variable)
     return value if type(value) is int else None
 
 
-def _find_value(found: ODVariable | None) -> object:
+def _find_value(variable: ODVariable | None) -> object:
     """What an object holds after a reset, or what the DCF writes; None if the file gives neither."""
-    if found is None:
+    if variable is None:
         return None
-    return found.default if found.value is None else found.value
+    return variable.default if variable.value is None else variable.value
 
 
 def find_sync(dictionary: Any) -> int:
@@ -133,14 +133,14 @@ def list_pdos(dictionary: Any, node: int) -> Iterator[Pdo]:
     """All PDOs of a dictionary, also those that are switched off; an empty mapping entry is left out."""
     for base, kind, first in ((RPDO, "RPDO", 0x200), (TPDO, "TPDO", 0x180)):
         for number in (index - base for index in sorted(dictionary) if base <= index < base + MAPPING):
-            predefined = first + 0x100 * number + node if number < 4 else INVALID
+            default_cob_id = first + 0x100 * number + node if number < 4 else INVALID
             cob_id = read_number(dictionary, base + number, 1)
             transmission = read_number(dictionary, base + number, 2)
             count = read_number(dictionary, base + MAPPING + number, 0) or 0
             words = [read_number(dictionary, base + MAPPING + number, sub) for sub in range(1, min(count, 64) + 1)]
             entries = tuple((word >> 16 & 0xFFFF, word >> 8 & 0xFF, word & 0xFF) for word in words if word)
             yield Pdo(f"{kind}{number + 1}", base + number, base == RPDO,
-                      predefined if cob_id is None else cob_id, 255 if transmission is None else transmission,
+                      default_cob_id if cob_id is None else cob_id, 255 if transmission is None else transmission,
                       entries)
 
 
@@ -158,73 +158,75 @@ def map_pdos(name: str, dictionary: Any, node: int, uses: Mapping[str, Use]) -> 
             of more than 8 bytes, or with a transmission type that the rig cannot serve.
     """
     pdos = list(list_pdos(dictionary, node))
-    on = [(pdo, [name_object(index, sub) for index, sub, _ in pdo.entries]) for pdo in pdos if not pdo.cob_id & INVALID]
+    valid_pdos = [(pdo, [name_object(index, sub) for index, sub, _ in pdo.entries])
+                  for pdo in pdos if not pdo.cob_id & INVALID]
     for key, use in uses.items():
         _check_object(name, dictionary, key, use)
-        if not any(key in keys and use.is_received in (pdo.is_received, None) for pdo, keys in on):
+        if not any(key in keys and use.is_received in (pdo.is_received, None) for pdo, keys in valid_pdos):
             raise use.place.refuse(_describe_unmapped(dictionary, pdos, key, use))
-    synchronous = {key for pdo, keys in on for key in keys if not pdo.is_received and 1 <= pdo.kind <= 240}
-    awaited = {key for key, use in uses.items() if use.is_needed} - synchronous  # only this PDO brings them
-    for pdo, keys in on:
-        if own := {key for key in keys if key in uses and uses[key].is_received in (pdo.is_received, None)}:
-            is_answer = 1 <= pdo.kind <= 240 or (pdo.kind in _EVENT and not awaited.isdisjoint(own))
-            yield _map_pdo(name, dictionary, pdo, own, is_answer=is_answer)
+    synchronous_keys = {key for pdo, keys in valid_pdos for key in keys if not pdo.is_received and 1 <= pdo.kind <= 240}
+    awaited_keys = {key for key, use in uses.items() if use.is_needed} - synchronous_keys  # only this PDO brings them
+    for pdo, keys in valid_pdos:
+        if used_keys := {key for key in keys if key in uses and uses[key].is_received in (pdo.is_received, None)}:
+            is_answer = 1 <= pdo.kind <= 240 or (pdo.kind in _EVENT and not awaited_keys.isdisjoint(used_keys))
+            yield _map_pdo(name, dictionary, pdo, used_keys, is_answer=is_answer)
 
 
 def _check_object(name: str, dictionary: Any, key: str, use: Use) -> None:
     """Refuse an object that is absent, no number, or that goes the other way."""
     index, sub = parse_object(key) or (0, 0)
-    found = find_variable(dictionary, index, sub)
-    if found is None:
+    variable = find_variable(dictionary, index, sub)
+    if variable is None:
         near = dictionary.get(index)
         subs = "" if near is None or isinstance(near, ODVariable) else (
             f"; it has the sub-indices {', '.join(map(str, list(near.subindices)[:12]))}")
         raise use.place.refuse(f"an object of {name}; it has no {key}{subs}")
-    use.place.require(found.data_type in _KINDS,
-                      f"a number; {key} ({found.name}) has the data type 0x{found.data_type or 0:04X}")
-    use.place.require(found.writable or not use.is_received,
-                      f"an object that can be written; {key} ({found.name}) is {found.access_type}")
-    use.place.require(found.readable or use.is_received is not False,
-                      f"an object that can be read; {key} ({found.name}) is {found.access_type}")
+    use.place.require(variable.data_type in _KINDS,
+                      f"a number; {key} ({variable.name}) has the data type 0x{variable.data_type or 0:04X}")
+    use.place.require(variable.writable or not use.is_received,
+                      f"an object that can be written; {key} ({variable.name}) is {variable.access_type}")
+    use.place.require(variable.readable or use.is_received is not False,
+                      f"an object that can be read; {key} ({variable.name}) is {variable.access_type}")
 
 
 def _describe_unmapped(dictionary: Any, pdos: list[Pdo], key: str, use: Use) -> str:
     """What to do about an object that is in no PDO that is on."""
     kind = "TPDO" if use.is_received is False else "RPDO"
-    own = [pdo for pdo in pdos if pdo.name.startswith(kind)]
-    off = next((pdo for pdo in own if any(name_object(index, sub) == key for index, sub, _ in pdo.entries)), None)
-    if off is not None:
-        return (f"an object that a {kind} maps; {off.name} maps {key}, but is switched off (bit 31 of "
-                f"0x{off.parameter:04X}:1)")
+    candidates = [pdo for pdo in pdos if pdo.name.startswith(kind)]
+    off_pdo = next((pdo for pdo in candidates
+                    if any(name_object(index, sub) == key for index, sub, _ in pdo.entries)), None)
+    if off_pdo is not None:
+        return (f"an object that a {kind} maps; {off_pdo.name} maps {key}, but is switched off (bit 31 of "
+                f"0x{off_pdo.parameter:04X}:1)")
     index, sub = parse_object(key) or (0, 0)
-    found = find_variable(dictionary, index, sub)
-    bits = len(found) if found is not None else 0
-    if found is not None and not found.pdo_mappable:
+    variable = find_variable(dictionary, index, sub)
+    bits = len(variable) if variable is not None else 0
+    if variable is not None and not variable.pdo_mappable:
         return f"an object that a {kind} maps; {key} cannot be mapped (PDOMapping=0)"
-    lacking = "".join(f"{pdo.name} maps {name_object(*at)}, which the file lacks; " for pdo in own
-                      for *at, _ in pdo.entries if at[0] > 0x1000 and find_variable(dictionary, *at) is None)
-    room = [pdo.name for pdo in own if pdo.length + bits <= _LONGEST]
+    remark = "".join(f"{pdo.name} maps {name_object(*at)}, which the file lacks; " for pdo in candidates
+                     for *at, _ in pdo.entries if at[0] > 0x1000 and find_variable(dictionary, *at) is None)
+    room = [pdo.name for pdo in candidates if pdo.length + bits <= _LONGEST]
     where = f"{' and '.join(room)} {'has' if len(room) == 1 else 'have'} room" if room else f"no {kind} has room"
-    return f"an object that a {kind} maps; {lacking}for {key} with {bits} bits {where} (map it in a DCF)"
+    return f"an object that a {kind} maps; {remark}for {key} with {bits} bits {where} (map it in a DCF)"
 
 
-def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: bool) -> DeviceFrame:
-    """The frame of a PDO; only `own` objects keep their names."""
+def _map_pdo(name: str, dictionary: Any, pdo: Pdo, used_keys: set[str], *, is_answer: bool) -> DeviceFrame:
+    """The frame of a PDO; only the objects of `used_keys` keep their names."""
     where = f"0x{pdo.mapping:04X}"
     require(0 < pdo.length <= _LONGEST, name, where, f"at most 8 bytes in {pdo.name}, not {pdo.length} bits")
     require(0 <= pdo.kind <= 240 or pdo.kind in _EVENT, name, f"0x{pdo.parameter:04X}:2",
             f"a transmission type 0 to 240, 254 or 255 for {pdo.name}, not {pdo.kind}")
     slots, lowest = [], 0
     for index, sub, length in pdo.entries:
-        key, found = name_object(index, sub), find_variable(dictionary, index, sub)
-        kind = Kind.UNSIGNED if found is None else _KINDS.get(found.data_type or 0, Kind.UNSIGNED)
-        size = 1 if found is None or found.data_type == datatypes.BOOLEAN else len(found)
+        key, variable = name_object(index, sub), find_variable(dictionary, index, sub)
+        kind = Kind.UNSIGNED if variable is None else _KINDS.get(variable.data_type or 0, Kind.UNSIGNED)
+        size = 1 if variable is None or variable.data_type == datatypes.BOOLEAN else len(variable)
         # Many devices map a BOOLEAN as a byte.
-        require(key not in own or length == size or (size, length) == (1, 8), name, where,
+        require(key not in used_keys or length == size or (size, length) == (1, 8), name, where,
                 f"{key} with {size} bits in {pdo.name}, not {length}")
         if kind is Kind.FLOAT and length != size:
             kind = Kind.UNSIGNED
-        slots.append(Slot(name=key if key in own else "", start=read_start(found),
+        slots.append(Slot(name=key if key in used_keys else "", start=read_start(variable),
                           bits=Field(name="", lowest=lowest, length=length, kind=kind)))
         lowest += length
     return DeviceFrame(slots=tuple(slots), spec=FrameSpec(
@@ -234,9 +236,9 @@ def _map_pdo(name: str, dictionary: Any, pdo: Pdo, own: set[str], *, is_answer: 
         is_before_sync=pdo.is_received and pdo.kind <= 240, is_answer=is_answer or pdo.is_received))
 
 
-def read_start(found: ODVariable | None) -> float:
+def read_start(variable: ODVariable | None) -> float:
     """The number that an object holds after a reset, 0 if the file gives none."""
-    value = _find_value(found)
+    value = _find_value(variable)
     return value if isinstance(value, int | float) and abs(value) < 1 << 64 else 0
 
 
@@ -264,31 +266,31 @@ def list_values(dictionary: Any) -> tuple[tuple[int, int, bytes], ...]:
     A PDO is switched off first, then its mapping is emptied, filled and counted, then its parameters follow, and last
     its COB-ID (CiA 301, 7.5.2.36).
     """
-    given: dict[tuple[int, int], bytes] = {}
+    values: dict[tuple[int, int], bytes] = {}
     for variable in list_variables(dictionary):
         if variable.value is not None and variable.writable and variable.index >= 0x1000:
             try:
-                given[variable.index, variable.subindex] = variable.encode_raw(variable.value)
+                values[variable.index, variable.subindex] = variable.encode_raw(variable.value)
             except (TypeError, ValueError, UnicodeError):
                 continue  # a value that does not fit its type cannot be written either
-    ordered = [(index, sub, data) for (index, sub), data in given.items() if not RPDO <= index < TPDO + 2 * MAPPING]
-    for parameter in sorted({index & ~MAPPING for index, _ in given if RPDO <= index < TPDO + 2 * MAPPING}):
-        mapping = {sub: data for (index, sub), data in given.items() if index == parameter + MAPPING}
-        own = {sub: data for (index, sub), data in given.items() if index == parameter and sub}
+    writes = [(index, sub, data) for (index, sub), data in values.items() if not RPDO <= index < TPDO + 2 * MAPPING]
+    for parameter in sorted({index & ~MAPPING for index, _ in values if RPDO <= index < TPDO + 2 * MAPPING}):
+        mapping = {sub: data for (index, sub), data in values.items() if index == parameter + MAPPING}
+        sub_values = {sub: data for (index, sub), data in values.items() if index == parameter and sub}
         default = read_number(dictionary, parameter, 1)
         if mapping and default is not None and dictionary[parameter][1].writable:
-            own.setdefault(1, default.to_bytes(4, "little"))
-        cob_id = own.pop(1, None)
+            sub_values.setdefault(1, default.to_bytes(4, "little"))
+        cob_id = sub_values.pop(1, None)
         if mapping and cob_id is not None:
-            ordered.append((parameter, 1, (int.from_bytes(cob_id, "little") | INVALID).to_bytes(4, "little")))
+            writes.append((parameter, 1, (int.from_bytes(cob_id, "little") | INVALID).to_bytes(4, "little")))
         count = mapping.pop(0, None)
         if count is not None and mapping:
-            ordered.append((parameter + MAPPING, 0, bytes(len(count))))
-        ordered += [*((parameter + MAPPING, sub, data) for sub, data in mapping.items()),
-                    *([(parameter + MAPPING, 0, count)] if count is not None else []),
-                    *((parameter, sub, data) for sub, data in own.items()),
-                    *([(parameter, 1, cob_id)] if cob_id is not None else [])]
-    return tuple(ordered)
+            writes.append((parameter + MAPPING, 0, bytes(len(count))))
+        writes += [*((parameter + MAPPING, sub, data) for sub, data in mapping.items()),
+                   *([(parameter + MAPPING, 0, count)] if count is not None else []),
+                   *((parameter, sub, data) for sub, data in sub_values.items()),
+                   *([(parameter, 1, cob_id)] if cob_id is not None else [])]
+    return tuple(writes)
 
 
 def list_variables(dictionary: Any) -> Iterator[ODVariable]:

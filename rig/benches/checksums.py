@@ -50,10 +50,10 @@ class Crc(NamedTuple):
 
     def list_bytes(self, each: Field, data: bytes, counter: int) -> bytes:
         """What it is computed over: data ID, data, and the data ID that belongs to this counter."""
-        own = each.lowest // 8
+        checksum_byte = each.lowest // 8
         before = each.data_id.to_bytes(2, "little") if self.has_data_id else b""
         behind = bytes([each.data_ids[counter % len(each.data_ids)]]) if each.data_ids else b""
-        return before + data[:own] + data[own + 1:] + behind
+        return before + data[:checksum_byte] + data[checksum_byte + 1:] + behind
 
 
 CHECKSUMS = {
@@ -93,14 +93,14 @@ def load_checksum(name: str, source: bytes, function: str) -> str:
     Raises:
         InputError: not Python, or no such function.
     """
-    known = f"{name}:{function}#{hashlib.sha256(source).hexdigest()[:8]}"
-    if known not in USERS_CHECKSUMS:
+    checksum = f"{name}:{function}#{hashlib.sha256(source).hexdigest()[:8]}"
+    if checksum not in USERS_CHECKSUMS:
         module = run_file(Path(name), source)
         for place, value in vars(module).items():  # tables: compiled code takes constants alone
             if isinstance(value, list | bytearray):
                 vars(module)[place] = bytes(value) if isinstance(value, bytearray) else tuple(value)
         require(callable(getattr(module, function, None)), name, function,
                 "a function (data: bytes, counter: int) -> int")
-        USERS_CHECKSUMS[known] = getattr(module, function)
-        compute_checksum(Field(name="", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=known), bytes(8), 0)
-    return known
+        USERS_CHECKSUMS[checksum] = getattr(module, function)
+        compute_checksum(Field(name="", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=checksum), bytes(8), 0)
+    return checksum

@@ -77,19 +77,19 @@ class Wanted(NamedTuple):
         """What names say of the signal of that word: the quantity, and which of several it is."""
         if word in _WORDS or word not in {s.word for s in self.signals}:
             return _WORDS.get(word, ({word}, {word}))
-        said = next(s for s in self.signals if s.word == word)
-        own, controlled = {word.replace("_", "").lower(), said.symbol.lower()}, self.signals.controlled
-        whole = f"{controlled.word}_{word}".lower() if said == self.signals.command else word.lower()
+        signal = next(s for s in self.signals if s.word == word)
+        names, controlled = {word.replace("_", "").lower(), signal.symbol.lower()}, self.signals.controlled
+        whole = f"{controlled.word}_{word}".lower() if signal == self.signals.command else word.lower()
         parts = {part for part in whole.split("_") if len(part) > 1}
         like = {self.signals.command.word: "position_demand", controlled.word: "ram_position",
-                self.signals.drive.word: "current" if said.unit == "A" else ""}.get(word, "")
+                self.signals.drive.word: "current" if signal.unit == "A" else ""}.get(word, "")
         quantity, which = _WORDS.get(like, (set(), set()))  # of the signal of the EHA with this role
-        return parts | own | quantity, own | which | ({word.lower().split("_")[-1]} if len(parts) > 1 else set())
+        return parts | names | quantity, names | which | ({word.lower().split("_")[-1]} if len(parts) > 1 else set())
 
     def is_known_object(self, key: str, word: str) -> bool:
         """Whether an object of CiA 402 holds that signal."""
-        known, s = _KNOWN_OBJECTS.get(key), self.signals
-        return (known == "command" and word == s.command.word) or (known == s.drive.unit and word == s.drive.word)
+        meaning, s = _KNOWN_OBJECTS.get(key), self.signals
+        return (meaning == "command" and word == s.command.word) or (meaning == s.drive.unit and word == s.drive.word)
 
 
 def guess_canopen(title: str, file: str, text: str, node: int | None, wanted: Wanted) -> str:
@@ -109,9 +109,9 @@ def guess_canopen(title: str, file: str, text: str, node: int | None, wanted: Wa
              f"node = {number}" + ("" if node or read_node(text) else f"  {UNSURE}the EDS does not say"),
              f"eds = {json.dumps(file)}", f'profile = "{profile}"{doubt}',
              *(['mode = 8                        # cyclic synchronous position'] if profile == "cia402" else [])]
-    for table, known in wanted.tables.items():
+    for table, units in wanted.tables.items():
         candidates = _list_objects(dictionary, number, is_received=table == "inputs")
-        lines += ["", f"[controller.{table}]", *_write_signals(candidates, known, wanted, "object", "0x0000")]
+        lines += ["", f"[controller.{table}]", *_write_signals(candidates, units, wanted, "object", "0x0000")]
     return "\n".join([_HEAD, *lines, ""])
 
 
@@ -120,20 +120,20 @@ _HEAD = "# Which device is under test, how it talks, and what its numbers mean. 
 
 def _list_objects(dictionary: Any, node: int, *, is_received: bool) -> list[Candidate]:
     """The objects that a PDO of this direction maps, without those of the profile."""
-    found = []
+    candidates = []
     for pdo in list_pdos(dictionary, node):
         for index, sub, _ in pdo.entries:
             variable = find_variable(dictionary, index, sub)
             if pdo.is_received is not is_received or pdo.cob_id & INVALID or variable is None:
                 continue
             key, count = name_object(index, sub), None
-            rated = read_number(dictionary, _RATED_CURRENT, 0)
+            rated_current = read_number(dictionary, _RATED_CURRENT, 0)
             if find_unit(variable.unit) is not None:
                 count = f"{variable.factor:g} {variable.unit}"
-            elif key == "0x6078" and rated:
-                count = f"{float(Fraction(rated, 1000)):g} mA"
-            found.append(Candidate(key, variable.qualname, variable.unit if count else "", count))
-    return [each for each in found if each.key not in ("0x6040", "0x6041", "0x6060", "0x6061")]  # the profile's
+            elif key == "0x6078" and rated_current:
+                count = f"{float(Fraction(rated_current, 1000)):g} mA"
+            candidates.append(Candidate(key, variable.qualname, variable.unit if count else "", count))
+    return [each for each in candidates if each.key not in ("0x6040", "0x6041", "0x6060", "0x6061")]  # the profile's
 
 
 def guess_can(title: str, file: str, text: str, wanted: Wanted) -> str:
@@ -146,32 +146,34 @@ def guess_can(title: str, file: str, text: str, wanted: Wanted) -> str:
     candidates = {message.name: [Candidate(f"{message.name}.{signal.name}", f"{message.name} {signal.name}",
                                            signal.unit or "")
                                  for signal in message.signals if not signal.is_multiplexer] for message in messages}
-    every = [each for own in candidates.values() for each in own]
+    all_candidates = [each for group in candidates.values() for each in group]
     command, drive = wanted.signals.command.word, wanted.signals.drive.word
     senders = {message.name: set(message.senders) for message in messages}
-    found = _assign(every, {command: wanted.tables["inputs"][command], drive: wanted.tables["outputs"][drive]}, wanted)
-    by = {word: senders[each.key.partition(".")[0]] for word, (each, _) in found.items()}
+    matches = _assign(
+        all_candidates, {command: wanted.tables["inputs"][command], drive: wanted.tables["outputs"][drive]}, wanted)
+    word_senders = {word: senders[each.key.partition(".")[0]] for word, (each, _) in matches.items()}
     nodes = set[str]().union(*senders.values())
-    device = by.get(drive) or nodes - by.get(command, nodes)  # the rig sends the demand
-    sent = [message for message in messages if device and senders[message.name] & device]
-    received = [message for message in messages if message not in sent]
-    inputs = [each for message in received for each in candidates[message.name]]
-    outputs = [each for message in (sent or messages) for each in candidates[message.name]]
+    device = word_senders.get(drive) or nodes - word_senders.get(command, nodes)  # the rig sends the demand
+    sent_messages = [message for message in messages if device and senders[message.name] & device]
+    received_messages = [message for message in messages if message not in sent_messages]
+    inputs = [each for message in received_messages for each in candidates[message.name]]
+    outputs = [each for message in (sent_messages or messages) for each in candidates[message.name]]
     lines = [f"name = {json.dumps(title)}", f"plant = {json.dumps(wanted.plant)}", 'cycle = "1 ms"',
              f"bitrate = 1_000_000  {UNSURE}the DBC does not say", "", "[controller]", 'protocol = "can"',
              f"dbc = {json.dumps(file)}", f'timeout = "20 ms"  {UNSURE}without a frame for so long the device is gone']
-    used = set()
-    for (table, known), own in zip(wanted.tables.items(), (inputs, outputs), strict=True):
-        chosen = {signal: unit for signal, unit in known.items() if signal not in _WORDS_OF_PROFILES}
-        names = {found.key.partition(".")[0] for found, _ in _assign(own, chosen, wanted).values()}
-        near = [each for each in own if each.key.partition(".")[0] in names] or own
-        lines += ["", f"[controller.{table}]", *_write_signals(near, chosen, wanted, "signal", "MESSAGE.SIGNAL")]
-        used |= names
-    lines += _write_states([message for message in messages if message.name in used], sent)
+    used_names = set()
+    for (table, all_units), group in zip(wanted.tables.items(), (inputs, outputs), strict=True):
+        units = {signal: unit for signal, unit in all_units.items() if signal not in _WORDS_OF_PROFILES}
+        names = {each.key.partition(".")[0] for each, _ in _assign(group, units, wanted).values()}
+        likely_candidates = [each for each in group if each.key.partition(".")[0] in names] or group
+        lines += ["", f"[controller.{table}]",
+                  *_write_signals(likely_candidates, units, wanted, "signal", "MESSAGE.SIGNAL")]
+        used_names |= names
+    lines += _write_states([message for message in messages if message.name in used_names], sent_messages)
     return "\n".join([_HEAD, *lines, ""])
 
 
-def _write_states(messages: Sequence[Any], sent: Sequence[Any]) -> list[str]:
+def _write_states(messages: Sequence[Any], sent_messages: Sequence[Any]) -> list[str]:
     """The tables of the enabling signals, of protection, and of the state that the rig awaits."""
     tables: dict[str, list[str]] = {"phases": [], "protection": [], "ready": []}
     for message in messages:
@@ -182,10 +184,11 @@ def _write_states(messages: Sequence[Any], sent: Sequence[Any]) -> list[str]:
                 tables["protection"].append(f'{key} = "crc8_sae_j1850"  {UNSURE}which checksum it is')
             elif words & {"counter", "cnt", "alive", "rolling", "sequence", "bz", "zaehler"}:
                 tables["protection"].append(f'{key} = "counter"')
-            elif message in sent and words & {"state", "status", "st", "sts", "mode", "zustand", "betrieb"}:
+            elif message in sent_messages and words & {"state", "status", "st", "sts", "mode", "zustand", "betrieb"}:
                 if values:
                     tables["ready"].append(f'{key} = "{values[0]}"  {UNSURE}the state in which main begins')
-            elif message not in sent and words & (_ENABLING | {"mode"} if values else _ENABLING) and signal.length <= 8:
+            elif (message not in sent_messages and words & (_ENABLING | {"mode"} if values else _ENABLING)
+                  and signal.length <= 8):
                 main = f'"{values[0]}"' if values else 1
                 tables["phases"].append(f"{key} = {{ setup = 0, main = {main}, cleanup = 0 }}  {UNSURE}what enables")
     return [line for name, lines in tables.items() if lines for line in ("", f"[controller.{name}]", *lines)]
@@ -200,34 +203,34 @@ def split_words(name: str) -> set[str]:
     return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+\d*(?![a-z])|[a-z]+\d+", name)} | {name.lower()}
 
 
-def _assign(candidates: Iterable[Candidate], known: Mapping[str, str], wanted: Wanted
+def _assign(candidates: Iterable[Candidate], units: Mapping[str, str], wanted: Wanted
             ) -> dict[str, tuple[Candidate, bool]]:
     """The likeliest candidate of each word, with its unit, and whether it is sure; no candidate is two signals."""
-    scored = []
+    scores = []
     for each in candidates:
         words = split_words(each.name) | {word for part in each.name.split() for word in split_words(part)}
-        for signal, unit in known.items():
+        for signal, unit in units.items():
             quantity, which = wanted.list_words(signal)
             fits = bool(unit) and fit_unit(each.unit, unit) is not None
             score = (3 * bool(words & quantity) + 2 * bool(words & which) + fits
                      + 9 * wanted.is_known_object(each.key, signal))
             if score >= 3 and (find_unit(each.unit) is None or fits):
-                scored.append((score, signal, each))
-    found: dict[str, tuple[Candidate, bool]] = {}
-    for score, signal, each in sorted(scored, key=lambda entry: -entry[0]):
-        if signal not in found and each not in [other for other, _ in found.values()]:
-            rivals = [other for points, name, other in scored if name == signal and points == score]
-            found[signal] = each, score >= 5 and len(rivals) == 1
-    return found
+                scores.append((score, signal, each))
+    matches: dict[str, tuple[Candidate, bool]] = {}
+    for score, signal, each in sorted(scores, key=lambda entry: -entry[0]):
+        if signal not in matches and each not in [other for other, _ in matches.values()]:
+            rivals = [other for points, name, other in scores if name == signal and points == score]
+            matches[signal] = each, score >= 5 and len(rivals) == 1
+    return matches
 
 
-def _write_signals(candidates: Sequence[Candidate], known: Mapping[str, str], wanted: Wanted, word: str, example: str
+def _write_signals(candidates: Sequence[Candidate], units: Mapping[str, str], wanted: Wanted, word: str, example: str
                    ) -> list[str]:
     """The lines of [inputs] or [outputs]."""
-    found, lines = _assign(candidates, known, wanted), []
-    for signal, unit in known.items():
-        if signal in found:
-            each, is_sure = found[signal]
+    matches, lines = _assign(candidates, units, wanted), []
+    for signal, unit in units.items():
+        if signal in matches:
+            each, is_sure = matches[signal]
             doubts = [] if is_sure else [f"is {each.name!r} the {signal}?"]
             entry = f'{signal} = {{ {word} = "{each.key}" }}' if word == "object" else f'{signal} = "{each.key}"'
             if unit and each.count is None and fit_unit(each.unit, unit) is None:
@@ -239,7 +242,7 @@ def _write_signals(candidates: Sequence[Candidate], known: Mapping[str, str], wa
         elif signal in wanted.needed:
             count = f', count = "{_USUAL.get(unit, f"1 {unit}")}"'
             lines.append(f'# {signal} = {{ {word} = "{example}"{count} }}  {UNSURE}nothing looks like it')
-    taken = {each.key for each, _ in found.values()}
+    used_keys = {each.key for each, _ in matches.values()}
     rest = [f"{each.key} ({each.name.rpartition(' ')[2] if word == 'signal' else each.name})" for each in candidates
-            if each.key not in taken]
+            if each.key not in used_keys]
     return [*lines, *([f"# not used: {', '.join(rest[:12])}{', ..' if len(rest) > 12 else ''}"] if rest else [])]

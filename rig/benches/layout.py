@@ -75,8 +75,8 @@ def use_reader(library: str, name: str, expected: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # of any kind
-        said = " ".join(str(error).split())[:200]
-        raise InputError(name, "", expected.format(said or type(error).__name__)) from error
+        message = " ".join(str(error).split())[:200]
+        raise InputError(name, "", expected.format(message or type(error).__name__)) from error
     finally:
         log.setLevel(level)
 
@@ -88,13 +88,13 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
         InputError: a used value that lies outside the frame or overlaps another one, has a length that its type cannot
             have, or whose counts have no known worth; a second counter or checksum.
     """
-    taken: dict[int, str] = {}
+    owners: dict[int, str] = {}
     guards: dict[Guard, str] = {}
     fields = []
     for slot in sorted(frame.slots, key=lambda slot: slot.name not in uses and not slot.is_selector):
         use, length = uses.get(slot.name), slot.bits.length
         places = list_bits(slot.bits) if length <= 64 else []
-        other = next((taken[place] for place in places if place in taken), "")
+        other = next((owners[place] for place in places if place in owners), "")
         is_inside = bool(places) and min(places) >= 0 and max(places) < 8 * frame.spec.length
         if use is not None:
             use.place.require(length <= 64 and (slot.bits.kind is not Kind.FLOAT or length in (32, 64)),
@@ -104,7 +104,7 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
                               f"bytes of {frame.spec.name}")
             use.place.require(not other, f"signals that do not overlap; {slot.name} has bits of {other}")
         if is_inside and not other:
-            taken |= dict.fromkeys(places, slot.name)
+            owners |= dict.fromkeys(places, slot.name)
             fields.append(_build_field(slot, use))
         if use is not None and use.guard is not Guard.NONE:
             use.place.require(use.guard not in guards, f"one {use.guard.name.lower()} in a frame; "
@@ -146,14 +146,14 @@ def _find_worth(slot: Slot, use: Use) -> tuple[Fraction, Fraction]:
         offset = slot.offset / slot.scale * use.count if slot.scale else Fraction(0)
         return use.count, offset if use.offset is None else use.offset
     if use.unit:
-        known = fit_unit(slot.unit or "", use.unit)
-        factor = known.factor if known else None
+        unit = fit_unit(slot.unit or "", use.unit)
+        factor = unit.factor if unit else None
     else:
         factor = _PLAIN.get(slot.unit or "")
     if factor is None:
-        said = "its file gives it no unit" if not slot.unit else f"its unit is {slot.unit!r}"
+        reason = "its file gives it no unit" if not slot.unit else f"its unit is {slot.unit!r}"
         worth = f"such as count = '1 {use.unit}'" if use.unit else "as a number"
-        raise use.place.refuse(f"also what a count of {slot.name} is worth, {worth}; {said}")
+        raise use.place.refuse(f"also what a count of {slot.name} is worth, {worth}; {reason}")
     return slot.scale * factor, slot.offset * factor if use.offset is None else use.offset
 
 
@@ -182,5 +182,5 @@ def compute_counts(slot: Slot, value: float | str, place: Place) -> float:
 
 def list_phases(slot: Slot, use: Use) -> dict[str, Any]:
     """The counts of a value in each phase; in the safe state as in clean-up, else as the device starts."""
-    given = {phase: compute_counts(slot, value, use.place.at(phase)) for phase, value in use.values.items()}
-    return dict.fromkeys(PHASES, slot.start) | {"safe": given.get("cleanup", slot.start)} | given
+    counts = {phase: compute_counts(slot, value, use.place.at(phase)) for phase, value in use.values.items()}
+    return dict.fromkeys(PHASES, slot.start) | {"safe": counts.get("cleanup", slot.start)} | counts

@@ -60,8 +60,8 @@ def find_frame(m: Layout, identifier: int) -> int:
     for number in range(words[FRAMES]):
         at = FRAMES_AT + FRAME_WORDS * number
         if words[at + IDENTIFIER] == identifier:
-            chosen = words[at + _SELECTOR]
-            if chosen < 0 or _read_bits(m, chosen) == words[chosen + _FIXED]:
+            selector = words[at + _SELECTOR]
+            if selector < 0 or _read_bits(m, selector) == words[selector + _FIXED]:
                 return at
     return -1
 
@@ -71,8 +71,8 @@ def pack_frame(m: Layout, at: int, cycle: int) -> None:
     """Write the payload of the frame at `at` from the values, which become what the receiver will read."""
     words = m.words
     words[PAYLOAD:PAYLOAD + 8] = 0
-    checksum, sent = -1, words[at + _COUNT_OF] + COUNT
-    number = words[sent]
+    checksum, count_at = -1, words[at + _COUNT_OF] + COUNT
+    number = words[count_at]
     for field in range(words[at + _FIRST], words[at + _END], _FIELD_WORDS):
         rule = words[field + _RULE]
         if rule == _VALUE:
@@ -83,7 +83,7 @@ def pack_frame(m: Layout, at: int, cycle: int) -> None:
         elif rule == _CONSTANT:
             _write_bits(m, field, words[field + _FIXED])
         elif rule == _COUNTER:
-            number = words[sent] % words[field + _FIXED]
+            number = words[count_at] % words[field + _FIXED]
             _write_bits(m, field, number)
         elif rule == _CYCLE:
             _write_bits(m, field, cycle)
@@ -91,7 +91,7 @@ def pack_frame(m: Layout, at: int, cycle: int) -> None:
             checksum = field
     if checksum >= 0:
         _write_bits(m, checksum, _compute_checksum(m, at, checksum, number))
-    words[sent] += 1
+    words[count_at] += 1
 
 
 @keep_apart
@@ -123,16 +123,16 @@ def unpack_frame(m: Layout, at: int, length: int, cycle: int) -> int:
         elif rule == _CHECKSUM:
             checksum = field
     number = _read_bits(m, counter) if counter >= 0 else 0
-    last = words[at + _COUNT_OF] + COUNT
+    count_at = words[at + _COUNT_OF] + COUNT
     if checksum >= 0:
-        said = _read_bits(m, checksum)
+        frame_checksum = _read_bits(m, checksum)
         _write_bits(m, checksum, 0)
-        if said != _compute_checksum(m, at, checksum, number):
+        if frame_checksum != _compute_checksum(m, at, checksum, number):
             words[at + UNSOUND] += 1
-            words[last] = -1
+            words[count_at] = -1
             return WRONG_CHECKSUM
     if counter >= 0:
-        before, words[last] = words[last], number
+        before, words[count_at] = words[count_at], number
         if before >= 0 and number != (before + 1) % words[counter + _FIXED]:
             words[at + UNSOUND] += 1
             if number == before:
@@ -155,31 +155,31 @@ def _integer(value: Any) -> int:
 @keep_apart
 def _write_bits(m: Layout, field: int, bits: int) -> None:
     """Put the lowest bits into the payload, a byte at a time."""
-    octets, place, left = m.octets, m.words[field + _LOWEST], m.words[field + _BITS]
-    while left > 0:
+    octets, place, remaining_bits = m.octets, m.words[field + _LOWEST], m.words[field + _BITS]
+    while remaining_bits > 0:
         octet, shift = 8 * PAYLOAD + place // 8, place % 8
-        count = min(8 - shift, left)
+        count = min(8 - shift, remaining_bits)
         mask = (1 << count) - 1
         octets[octet] = _integer(octets[octet]) & ~(mask << shift) & 0xFF | (bits & mask) << shift
         bits >>= count
-        left -= count
+        remaining_bits -= count
         place = _find_next_byte(m, field, place)
 
 
 @keep_apart
 def _read_bits(m: Layout, field: int) -> int:
     """The bits of a field as a number from 0; of 64 bits with the sign of a signed one."""
-    place, left = m.words[field + _LOWEST], m.words[field + _BITS]
-    bits, done = 0, 0
-    while left > 0:
+    place, remaining_bits = m.words[field + _LOWEST], m.words[field + _BITS]
+    bits, position = 0, 0
+    while remaining_bits > 0:
         shift = place % 8
-        count = min(8 - shift, left)
+        count = min(8 - shift, remaining_bits)
         part = _integer(m.octets[8 * PAYLOAD + place // 8]) >> shift & (1 << count) - 1
-        if done + count == 64 and part >> count - 1:  # the sign, which Python's shift does not set
+        if position + count == 64 and part >> count - 1:  # the sign, which Python's shift does not set
             part -= 1 << count
-        bits |= part << done
-        done += count
-        left -= count
+        bits |= part << position
+        position += count
+        remaining_bits -= count
         place = _find_next_byte(m, field, place)
     return _integer(bits)
 
@@ -236,12 +236,12 @@ def _compute_checksum(m: Layout, at: int, field: int, counter: int) -> int:
         _call_checksum(words[field + _FIXED], base + 8 * _SCRATCH, base + 8 * (_SCRATCH + 1),
                        0, 0, length, 1, base + 8 * PAYLOAD, length, 1, counter)
         return _integer(words[_SCRATCH]) & _find_mask(words[field + _BITS])
-    crc, polynomial, own = words[field + _START], words[field + _POLYNOMIAL], words[field + _LOWEST] // 8
+    crc, polynomial, checksum_byte = words[field + _START], words[field + _POLYNOMIAL], words[field + _LOWEST] // 8
     if words[field + _DATA_ID] >= 0:
         crc = add_byte(crc, words[field + _DATA_ID] & 0xFF, polynomial)
         crc = add_byte(crc, words[field + _DATA_ID] >> 8, polynomial)
     for i in range(length):
-        if i != own:
+        if i != checksum_byte:
             crc = add_byte(crc, _integer(m.octets[8 * PAYLOAD + i]), polynomial)
     if words[field + _DATA_IDS_AT]:
         ids = words[field + _DATA_IDS_AT]
@@ -252,13 +252,13 @@ def _compute_checksum(m: Layout, at: int, field: int, counter: int) -> int:
 # ---------------------------------------------------------------------------------------- made before the start
 
 
-def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role) -> Layout:
-    """The tables of these frames for a loop that sends those of `mine` and receives the others.
+def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], sender: Role) -> Layout:
+    """The tables of these frames for a loop that sends those of `sender` and receives the others.
 
     Args:
         frames: in the order in which they are sent.
         channels: names of the values; what is not among them is skipped in frames that come.
-        mine: who sends.
+        sender: whose frames the loop sends.
     """
     width = FRAMES_AT + FRAME_WORDS * len(frames)
     values = width + _FIELD_WORDS * sum(len(each.fields) for each in frames)
@@ -269,7 +269,7 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], mine: Role
     places = {name: i for i, name in enumerate(channels)}
     at, field, firsts = FRAMES_AT, width, dict[int, int]()
     for number, each in enumerate(frames):
-        is_mine = each.sender is mine
+        is_mine = each.sender is sender
         rules = [_find_rule(one) for one in each.fields]
         words[at: at + FRAME_WORDS] = (
             each.identifier, each.length, each.every, is_mine, each.is_before_sync, each.is_answer, _CYCLE in rules,

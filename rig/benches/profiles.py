@@ -116,14 +116,14 @@ def find_wanted(words: ProfileWords, control: int) -> int:
     return match_word(words.commands, control, State.OFF)
 
 
-def choose_control(words: ProfileWords, wanted: int, state: int, before: int = 0, resets: bool = False) -> int:
+def choose_control(words: ProfileWords, goal: int, state: int, before: int = 0, resets: bool = False) -> int:
     """The next control word on the way to a `State`.
 
     From QUICK_STOP the way up leads over OFF, because not every drive has transition 16.
 
     Args:
         words: of the profile.
-        wanted: OFF, READY, ON, ACTIVE or QUICK_STOP.
+        goal: OFF, READY, ON, ACTIVE or QUICK_STOP.
         state: what the last status word said; UNKNOWN before the first.
         before: the last control word.
         resets: acknowledge a fault. The edge must rise: where `before` has the bit already, it falls first.
@@ -131,39 +131,40 @@ def choose_control(words: ProfileWords, wanted: int, state: int, before: int = 0
     >>> [choose_control(CIA402, State.ACTIVE, state) for state in (State.OFF, State.READY, State.ON, State.ACTIVE)]
     [6, 7, 15, 15]
     """
-    if wanted == State.QUICK_STOP:
+    if goal == State.QUICK_STOP:
         return words.quick_stop
     if state == State.FAULT and resets and before & words.reset == 0:
         return words.reset
     if state <= State.ACTIVE:
-        return words.ladder[min(wanted, state + 1)]
-    return words.ladder[min(wanted, 1)] if state == State.UNKNOWN else words.ladder[0]
+        return words.ladder[min(goal, state + 1)]
+    return words.ladder[min(goal, 1)] if state == State.UNKNOWN else words.ladder[0]
 
 
 def list_transitions() -> list[tuple[int, int]]:
-    """State and wanted state of the transitions of CiA 402 that every drive makes when a control word asks for them."""
-    return [(int(before), int(asked)) for number, (before, _, asked) in TRANSITIONS.items()
-            if asked is not None and number not in (15, 16)]
+    """State and goal of the transitions of CiA 402 that every drive makes when a control word asks for them."""
+    return [(int(before), int(goal)) for number, (before, _, goal) in TRANSITIONS.items()
+            if goal is not None and number not in (15, 16)]
 
 
-def list_reachable(state: int, wanted: frozenset[int], *, resets: bool) -> frozenset[int]:
+def list_reachable(state: int, goals: frozenset[int], *, resets: bool) -> frozenset[int]:
     """The states of CiA 402 that a drive may be in next, some transitions after `state`.
 
     Args:
         state: before.
-        wanted: what the control words since then have asked for.
+        goals: what the control words since then have asked for.
         resets: whether the reset bit rose among them.
     """
     # 7 and 10 are by Quick stop as well; Enable operation may mean 3 and 4
-    asked = {*wanted, *([State.FAULT] if resets else []), *([State.OFF] if State.QUICK_STOP in wanted else []),
-             *([State.ON] if State.ACTIVE in wanted else [])}
-    found, rest = {state}, [state]
+    all_goals = {*goals, *([State.FAULT] if resets else []), *([State.OFF] if State.QUICK_STOP in goals else []),
+                 *([State.ON] if State.ACTIVE in goals else [])}
+    states, rest = {state}, [state]
     while rest:
         before = rest.pop()
-        after = {to for start, to, word in TRANSITIONS.values() if start == before and (word is None or word in asked)}
+        after = {to for start, to, word in TRANSITIONS.values()
+                 if start == before and (word is None or word in all_goals)}
         after.add(State.FAULT_REACTION)  # 13
         if before == State.QUICK_STOP:
             after.add(State.OFF)  # 12 is automatic with some quick stop option codes
-        rest += after - found
-        found |= after
-    return frozenset(found)
+        rest += after - states
+        states |= after
+    return frozenset(states)
