@@ -17,8 +17,8 @@ _STRINGS = (datatypes.VISIBLE_STRING, datatypes.OCTET_STRING, datatypes.DOMAIN)
 
 def find_struct(entry: ODVariable) -> struct.Struct | None:
     """What packs the number of an entry; None for strings and domains, and for numbers of 24 bits and the like."""
-    known = ODVariable.STRUCT_TYPES.get(entry.data_type or 0)
-    return known if type(known) is struct.Struct else None
+    packer = ODVariable.STRUCT_TYPES.get(entry.data_type or 0)
+    return packer if type(packer) is struct.Struct else None
 
 
 def read_default(entry: ODVariable) -> Value:

@@ -36,11 +36,11 @@ class Emcy:
     """The errors in force. One frame as an error comes, one as it goes; repeats of a standing error say nothing new.
 
     An error is its code and its first information byte (which PDO, which node), so that two nodes lost are two errors.
-    `permitted()` says whether the NMT state lets EMCY through; register and history are kept in any state.
+    `is_permitted()` says whether the NMT state lets EMCY through; register and history are kept in any state.
     """
 
-    def __init__(self, od: Dictionary, send: Callable[[int, bytes], None], permitted: Callable[[], bool]) -> None:
-        self._od, self._send, self._permitted = od, send, permitted
+    def __init__(self, od: Dictionary, send: Callable[[int, bytes], None], is_permitted: Callable[[], bool]) -> None:
+        self._od, self._send, self._is_permitted = od, send, is_permitted
         self._active: dict[tuple[int, bytes], int] = {}  # (code, information) -> register bits
 
     @property
@@ -63,10 +63,10 @@ class Emcy:
 
     def clear(self, code: int | None = None, info: bytes = b"") -> None:
         """All errors of that code (and information) are gone, without `code` every error; says so if there were any."""
-        gone = [key for key in self._active if code in (None, key[0]) and info[:1] in (b"", key[1])]
-        for key in gone:
+        keys = [key for key in self._active if code in (None, key[0]) and info[:1] in (b"", key[1])]
+        for key in keys:
             del self._active[key]
-        if gone:
+        if keys:
             self._transmit(EmcyCode.RESET, b"")
 
     def erase_history(self) -> None:
@@ -87,5 +87,5 @@ class Emcy:
         register = reduce(or_, self._active.values(), 0)
         self._od.values[REGISTER, 0] = register
         cob_id = self._od.read_number(COB_ID, 0, INVALID)
-        if self._permitted() and not cob_id & INVALID:
+        if self._is_permitted() and not cob_id & INVALID:
             self._send(cob_id & 0x7FF, _FRAME.pack(code, register, info[:5]))

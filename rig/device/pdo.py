@@ -61,9 +61,9 @@ class Pdo:
 class Rpdo(Pdo):
     """A received PDO: put into the dictionary on arrival, or kept until the next SYNC if it is synchronous."""
 
-    def __init__(self, n: int, od: Dictionary, emcy: Emcy, arrived: Callable[[int], None]) -> None:
+    def __init__(self, n: int, od: Dictionary, emcy: Emcy, report_arrival: Callable[[int], None]) -> None:
         self.fresh = False  # synchronous: a new frame was latched at this SYNC
-        self._emcy, self._arrived = emcy, arrived
+        self._emcy, self._report_arrival = emcy, report_arrival
         self._waiting: bytes | None = None
         self._faulty = False
         super().__init__(n, od, RPDO)
@@ -86,7 +86,7 @@ class Rpdo(Pdo):
             self._waiting = data
         else:
             self._od.values.update(zip(self._keys, self._unpack(data), strict=True))
-            self._arrived(self.n)
+            self._report_arrival(self.n)
 
     def latch(self) -> None:
         """SYNC: what came last becomes valid."""
@@ -152,12 +152,12 @@ class Tpdo(Pdo):
 class Pdos:
     """All PDOs of a device, by number from 1, and the ones a SYNC concerns."""
 
-    def __init__(self, od: Dictionary, emcy: Emcy, send: Send, arrived: Callable[[int], None]) -> None:
+    def __init__(self, od: Dictionary, emcy: Emcy, send: Send, report_arrival: Callable[[int], None]) -> None:
         def numbers(base: int) -> list[int]:
             return [n for n in range(1, MAPPING + 1) if (base + n - 1, 1) in od.entries]
 
         self._od = od
-        self.rpdos = {n: Rpdo(n, od, emcy, arrived) for n in numbers(RPDO)}
+        self.rpdos = {n: Rpdo(n, od, emcy, report_arrival) for n in numbers(RPDO)}
         self.tpdos = {n: Tpdo(n, od, send) for n in numbers(TPDO)}
         self._all: list[Rpdo | Tpdo] = [*self.rpdos.values(), *self.tpdos.values()]
         self.configure()

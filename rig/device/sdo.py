@@ -128,13 +128,13 @@ class SdoServer:
 
     def _begin_download(self, command: int, data: bytes) -> None:
         size = self._size(*self._object)
-        expedited, announced = command & 2, command & 1
-        if expedited:
-            length = 4 - (command >> 2 & 3) if announced else size or 4
+        is_expedited, is_announced = command & 2, command & 1
+        if is_expedited:
+            length = 4 - (command >> 2 & 3) if is_announced else size or 4
             self._download(*self._object, data[4 : 4 + length])
             return
         self._fixed = size
-        if announced:
+        if is_announced:
             self._announced = int.from_bytes(data[4:], "little")
             abort_unless(not size or self._announced >= size, Abort.TOO_SHORT)
             abort_unless(not size or self._announced <= size, Abort.TOO_LONG)
@@ -169,7 +169,7 @@ class SdoServer:
         return bytes((toggle | (7 - len(part)) << 1 | last,)) + part
 
     def _check_length(self, last: bool) -> None:
-        length, known = len(self._buffer), self._fixed or self._announced
-        abort_unless(known is None or length <= known, Abort.TOO_LONG)
+        length, limit = len(self._buffer), self._fixed or self._announced
+        abort_unless(limit is None or length <= limit, Abort.TOO_LONG)
         abort_unless(length <= _LARGEST, Abort.MEMORY)
         abort_unless(not last or self._announced is None or length >= self._announced, Abort.TOO_SHORT)

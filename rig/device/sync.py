@@ -12,9 +12,9 @@ from rig.network import Frame
 class SyncConsumer:
     """Runs `cycle` at each SYNC; raises EMCY 0x8100 when they stop and 0x8240 for one that carries data."""
 
-    def __init__(self, emcy: Emcy, cycle: Callable[[], None], lost: Callable[[], None]) -> None:
-        """`cycle()` at each SYNC; `lost()` when they stop, after the EMCY."""
-        self._emcy, self._cycle, self._report_lost = emcy, cycle, lost
+    def __init__(self, emcy: Emcy, cycle: Callable[[], None], report_lost: Callable[[], None]) -> None:
+        """`cycle()` at each SYNC; `report_lost()` when they stop, after the EMCY."""
+        self._emcy, self._cycle, self._report_lost = emcy, cycle, report_lost
         self._limit_ns = 0
         self._deadline = 0  # 0: not waiting
         self._lost = self._malformed = False

@@ -451,7 +451,7 @@ DEFECTS: list[tuple[str, Break, str]] = [
     ("history not erased", wrap("emcy.erase_history", lambda device, old: None), "5.6"),
     ("SYNC with data: another error", send_instead(EMCY, lambda data: b"\x00\x50" + data[2:]
                                                    if data[:2] == b"\x40\x82" else data), "5.16"),
-    ("EMCY in STOPPED", wrap("emcy._permitted", lambda device, old: True), "6.10"),
+    ("EMCY in STOPPED", wrap("emcy._is_permitted", lambda device, old: True), "6.10"),
     ("heartbeat too slow", wrap("heartbeat.configure", lambda device, old, period, t_ns: old(period * 12 // 10, t_ns)),
      "5.7"),
     ("heartbeat with toggle bit", send_instead(HEARTBEAT, lambda data: bytes((data[0] | 0x80,)) if data[0] else data),
