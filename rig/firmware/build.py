@@ -79,8 +79,8 @@ def build_program(name: str, sources: Sequence[Path], flags: Sequence[str]) -> P
 def find_compiler(where: str = "--controller", use: str = "to build the firmware with") -> str:
     """The path of the C compiler. Raises InputError, with what it is for, if there is none."""
     for name in ("gcc", "cc", "clang"):
-        if found := shutil.which(name):
-            return found
+        if path := shutil.which(name):
+            return path
     raise InputError(where, "", f"a C compiler {use}: apt-get install gcc libc6-dev")
 
 
@@ -91,10 +91,11 @@ def compile_c(compiler: str, words: Sequence[str], program: Path) -> None:
         RigError: with the first error that the compiler reports.
     """
     with write_whole(program) as part:
-        done = subprocess.run([compiler, *words, "-o", str(part), "-lm"], capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            said = done.stderr.splitlines()
-            lines = [line for line in said if "error" in line or "undefined" in line] or said
+        process = subprocess.run([compiler, *words, "-o", str(part), "-lm"], capture_output=True, text=True,
+                                 check=False)
+        if process.returncode != 0:
+            messages = process.stderr.splitlines()
+            lines = [line for line in messages if "error" in line or "undefined" in line] or messages
             raise RigError(f"{compiler}: {(lines or ['no message'])[0]}")
 
 

@@ -19,7 +19,7 @@ _KINDS = {"f": "KIND_REAL", "d": "KIND_REAL", **dict.fromkeys("bhlq", "KIND_SIGN
 
 def write_object_table(eds: Path = EDS[2]) -> dict[str, str]:
     """The two C files, name to text, for a device of any node-ID. Raises InputError for an EDS that cannot be read."""
-    entries, others = sorted(Dictionary(eds, 1).entries.items()), Dictionary(eds, 2).entries
+    entries, node_2_entries = sorted(Dictionary(eds, 1).entries.items()), Dictionary(eds, 2).entries
     header = [
         f"/* Objects of a node, generated from {eds.name} by object_table.py: do not edit. */",
         "#ifndef OBJECT_TABLE_H", "#define OBJECT_TABLE_H", "", '#include "dictionary.h"', "",
@@ -30,7 +30,7 @@ def write_object_table(eds: Path = EDS[2]) -> dict[str, str]:
     source = ["/* Generated, see object_table.h. */", '#include "object_table.h"', "",
               "const struct object OBJECT_TABLE[OBJECT_COUNT] = {"]  # fmt: skip
     for key, entry in entries:
-        source += [f"    /* {entry.name} */", f"    {_write_entry(*key, entry, read_default(others[key]))},"]
+        source += [f"    /* {entry.name} */", f"    {_write_entry(*key, entry, read_default(node_2_entries[key]))},"]
     return {"object_table.h": "\n".join(header), "object_table.c": "\n".join([*source, "};", ""])}
 
 
@@ -46,8 +46,8 @@ def _write_entry(index: int, sub: int, entry: ODVariable, default_of_node_2: Val
         length = len(default)
     elif number is not None:
         kind, size = _KINDS.get(number.format.lstrip("<"), "KIND_UNSIGNED"), number.size
-        packed = number.pack(default - flags["NODE_RELATIVE"])
-        bits = f"0x{int.from_bytes(packed, 'little'):X}u" + "ll" * (size == 8)  # as an unsigned integer constant
+        data = number.pack(default - flags["NODE_RELATIVE"])
+        bits = f"0x{int.from_bytes(data, 'little'):X}u" + "ll" * (size == 8)  # as an unsigned integer constant
     return (f"{{0x{index:04X}, 0x{sub:02X}, {kind}, {size}, {words}, {bits}, {entry.min or 0}, {entry.max or 0}, "
             f"{text}, {length}}}")
 
