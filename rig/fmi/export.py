@@ -114,23 +114,23 @@ def export_fmu(model: Model, out: Path, version: str = "2", seed: int = 0) -> li
 
 def _build_libraries(model: Model, run: Any, tables: str, sources: Sequence[Path]) -> dict[Platform, bytes]:
     """The library for each platform that can be compiled for here."""
-    made = {}
+    libraries = {}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "unit_tables.h").write_text(tables)
         code, library = Path(folder, "plant.o"), Path(folder, "library")
         for machine, compiler in find_platforms():
-            emitted = emit_object(run, "advance_unit", machine.triple)
-            if emitted is None:
+            object_code = emit_object(run, "advance_unit", machine.triple)
+            if object_code is None:
                 raise InputError("effects", ", ".join(model.effects), "laws that need nothing but arithmetic")
-            code.write_bytes(emitted)
+            code.write_bytes(object_code)
             words = [*_FLAGS, *machine.flags, f"-I{folder}", f"-I{FOLDER}", *map(str, sources), str(code)]
             try:
                 compile_c(compiler, words, library)
-                made[machine] = library.read_bytes()
+                libraries[machine] = library.read_bytes()
             except RigError:
-                if not made:  # this machine; a compiler for another one may lack its C library
+                if not libraries:  # this machine; a compiler for another one may lack its C library
                     raise
-    return made
+    return libraries
 
 
 def find_platforms() -> list[tuple[Platform, str]]:
@@ -139,11 +139,11 @@ def find_platforms() -> list[tuple[Platform, str]]:
     Raises:
         InputError: no C compiler for this machine, or a machine that is not in the table.
     """
-    own = f"{platform.machine()}-{platform.system().lower()}"
-    here = [machine for machine in PLATFORMS if machine.name == own]
-    require(here, "--fmu", own, f"a machine that is one of {', '.join(m.name for m in PLATFORMS)}")
-    others = ((machine, shutil.which(machine.compiler)) for machine in PLATFORMS if machine.name != own)
-    return [(here[0], find_compiler("--fmu", "to link the FMU with")),
+    name = f"{platform.machine()}-{platform.system().lower()}"
+    matches = [machine for machine in PLATFORMS if machine.name == name]
+    require(matches, "--fmu", name, f"a machine that is one of {', '.join(m.name for m in PLATFORMS)}")
+    others = ((machine, shutil.which(machine.compiler)) for machine in PLATFORMS if machine.name != name)
+    return [(matches[0], find_compiler("--fmu", "to link the FMU with")),
             *((machine, compiler) for machine, compiler in others if compiler)]
 
 
@@ -167,7 +167,7 @@ def list_variables(model: Model) -> list[Variable]:
     """Time, inputs, outputs and parameters of the unit, by value reference."""
     signals = model.kind.signals
     load = signals.load
-    found = [
+    variables = [
         Variable("time", "TIME", "s", "time"),
         Variable(signals.command.name, "INPUT", signals.command.unit,
                  f"{signals.command.quantity}; used where closed_loop is true"),
@@ -190,9 +190,9 @@ def list_variables(model: Model) -> list[Variable]:
         high = min(q.high, math.nextafter(q.below, -math.inf), _LARGEST)
         if q.words:
             low, high = min(q.words.values()), max(q.words.values())
-        found.append(Variable(name, "FIXED" if name == "controller.period" else "TUNABLE", q.unit, text, model[name],
-                              low, high))
-    return found
+        variables.append(Variable(name, "FIXED" if name == "controller.period" else "TUNABLE", q.unit, text,
+                                  model[name], low, high))
+    return variables
 
 
 # -------------------------------------------------------------------------------------------- tables for the C code

@@ -62,24 +62,24 @@ def read_description(path: Path) -> Description:
             version = (re.findall(rb"""fmiVersion\s*=\s*["'](.*?)["']""", archive.read("modelDescription.xml")) or
                        [b"none"])[0].decode(errors="replace")
         if version[:2] in ("2.", "3."):
-            found = fmpy.read_model_description(str(path), validate=False)
+            description = fmpy.read_model_description(str(path), validate=False)
     except Exception as error:  # FMPy raises Exception itself
-        said = " ".join(str(error).split())
-        raise InputError(path, "modelDescription.xml", f"that of an FMU 2.0 or 3.0 ({said})") from error
+        message = " ".join(str(error).split())
+        raise InputError(path, "modelDescription.xml", f"that of an FMU 2.0 or 3.0 ({message})") from error
     require(version[:2] in ("2.", "3."), path, "fmiVersion", f"2.0 or 3.0, not {version}")
-    unit = found.coSimulation
-    kind = "model exchange" if found.modelExchange is not None else "scheduled execution"
+    unit = description.coSimulation
+    kind = "model exchange" if description.modelExchange is not None else "scheduled execution"
     require(unit is not None, path, "", f"an FMU for co-simulation; this one is for {kind} only")
     folders = [fmpy.platform_tuple, *([fmpy.platform] if version[0] == "2" else [])]
     libraries = [f"binaries/{folder}/{unit.modelIdentifier}{fmpy.sharedLibraryExtension}" for folder in folders]
     library = next((name for name in libraries if name in names), None)
     if library is None:
-        there = sorted(name for name in names if name.startswith("binaries/") and not name.endswith("/"))
-        offered = f"only {', '.join(there)}" if there else "none"
+        binaries = sorted(name for name in names if name.startswith("binaries/") and not name.endswith("/"))
+        content = f"only {', '.join(binaries)}" if binaries else "none"
         if any(name.startswith("sources/") for name in names):
-            offered += f" and source code: python -m fmpy compile {path.name}"
-        raise InputError(path, "binaries", f"a library {libraries[-1]}; it has {offered}")
-    variables = {v.name: v for v in found.modelVariables}
+            content += f" and source code: python -m fmpy compile {path.name}"
+        raise InputError(path, "binaries", f"a library {libraries[-1]}; it has {content}")
+    variables = {v.name: v for v in description.modelVariables}
     step = unit.fixedInternalStepSize
     return Description(path, library, variables, version, None if step is None else float(step))
 
@@ -90,16 +90,17 @@ def find_variable(description: Description, name: str, causality: Sequence[str],
     Raises:
         InputError: there is none, or one of another kind.
     """
-    found = description.variables.get(name)
-    if found is None:
+    variable = description.variables.get(name)
+    if variable is None:
         hint = suggest_name(name, list(description.variables))
         raise place.refuse(f"a variable of {description.path.name}, not {name!r}{hint}")
-    place.require(found.causality in causality,
-                  f"a variable that is {' or '.join(causality)}; {name} is {found.causality}")
-    kind = _NUMBERS.get(found.type) if description.version[0] == "2" else found.type.replace("Enumeration", "Int64")
-    if kind is None or kind in ("String", "Binary", "Clock") or found.dimensions:
-        raise place.refuse(f"a variable that is one number; {name} is of type {found.type}")
-    return int(found.valueReference), kind
+    place.require(variable.causality in causality,
+                  f"a variable that is {' or '.join(causality)}; {name} is {variable.causality}")
+    kind = _NUMBERS.get(variable.type) if description.version[0] == "2" else (
+        variable.type.replace("Enumeration", "Int64"))
+    if kind is None or kind in ("String", "Binary", "Clock") or variable.dimensions:
+        raise place.refuse(f"a variable that is one number; {name} is of type {variable.type}")
+    return int(variable.valueReference), kind
 
 
 class Unit:
@@ -112,10 +113,10 @@ class Unit:
         Raises:
             InputError: the unit takes steps of another length.
         """
-        fixed = description.step
-        require(not fixed or abs(cycle / fixed - round(cycle / fixed)) <= 1e-6, description.path,
+        step = description.step
+        require(not step or abs(cycle / step - round(cycle / step)) <= 1e-6, description.path,
                 "fixedInternalStepSize",
-                f"a step of which the cycle of {cycle * 1e3:g} ms is a multiple, not {(fixed or 0.0) * 1e3:g} ms")
+                f"a step of which the cycle of {cycle * 1e3:g} ms is a multiple, not {(step or 0.0) * 1e3:g} ms")
         self._path, self._library, self._cycle = description.path, description.library, cycle
         self._inputs, self._outputs, self._parameters = tuple(inputs), tuple(outputs), tuple(parameters)
         self._lock = RLock()
@@ -142,10 +143,10 @@ class Unit:
         worth = [port.worth for port in self._inputs]
         rows = (given[:-1, :len(worth)] / worth).tolist()
         with self._lock:  # no other run in between
-            found = [self._ask("begin", self._list_settings(values))]
+            readings = [self._ask("begin", self._list_settings(values))]
             for k in range(0, len(rows), CYCLES_A_CALL):
-                found += self._ask("run", rows[k:k + CYCLES_A_CALL])
-        return self._scale(found)
+                readings += self._ask("run", rows[k:k + CYCLES_A_CALL])
+        return self._scale(readings)
 
     def close(self) -> None:
         """End the process."""
@@ -156,13 +157,13 @@ class Unit:
             process.wait()
 
     def _scale(self, values: Any) -> Array:
-        found: Array = np.asarray(values, float) * [port.worth for port in self._outputs]
-        if not np.isfinite(found).all():
-            rows = np.atleast_2d(found)
+        readings: Array = np.asarray(values, float) * [port.worth for port in self._outputs]
+        if not np.isfinite(readings).all():
+            rows = np.atleast_2d(readings)
             k, i = np.argwhere(~np.isfinite(rows))[0]
-            t = (self._k if found.ndim == 1 else k) * self._cycle
+            t = (self._k if readings.ndim == 1 else k) * self._cycle
             raise Diverged(f"{self._path}: the unit gives {rows[k, i]} for {self._outputs[i].name} at {t:.6g} s")
-        return found
+        return readings
 
     def _list_settings(self, values: Mapping[str, float]) -> Settings:
         return [(port.variable, values[port.name] / port.worth) for port in self._parameters if port.name in values]
@@ -193,8 +194,8 @@ class Unit:
         status = process.wait()
         self.close()
         cause = signals_of_processes.Signals(-status).name if status < 0 else f"exit status {status}"
-        said = Path(self._folder.name, "messages.txt").read_text(errors="replace").split("\n")
-        last = next((f"; its last message: {line.strip()}" for line in reversed(said) if line.strip()), "")
+        message_lines = Path(self._folder.name, "messages.txt").read_text(errors="replace").split("\n")
+        last = next((f"; its last message: {line.strip()}" for line in reversed(message_lines) if line.strip()), "")
         raise RigError(f"{self._path}: the unit crashed in {name} ({cause}){last}")
 
     def _start(self) -> None:
@@ -202,13 +203,13 @@ class Unit:
         self._folder = tempfile.TemporaryDirectory(prefix="eha-rig-fmu-")
         with zipfile.ZipFile(self._path) as archive:
             archive.extractall(self._folder.name)  # it refuses names that lead out of the folder
-        ours, theirs = socket.socketpair()
-        with Path(self._folder.name, "messages.txt").open("wb") as messages, theirs:
+        rig_socket, host_socket = socket.socketpair()
+        with Path(self._folder.name, "messages.txt").open("wb") as messages, host_socket:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "rig.fmi.host", str(theirs.fileno()), self._folder.name],
-                pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=messages, stderr=messages,
+                [sys.executable, "-m", "rig.fmi.host", str(host_socket.fileno()), self._folder.name],
+                pass_fds=[host_socket.fileno()], stdin=subprocess.DEVNULL, stdout=messages, stderr=messages,
                 start_new_session=True)
-        self._connection = Connection(ours.detach())
+        self._connection = Connection(rig_socket.detach())
         weakref.finalize(self, self._process.kill)
         self._ask("load", self._folder.name, str(Path(self._folder.name, self._library)),
                   [port.variable for port in self._inputs], [port.variable for port in self._outputs], self._cycle)

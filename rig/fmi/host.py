@@ -53,7 +53,7 @@ class Host:
         self._description = fmpy.read_model_description(folder, validate=False)
         self._unit: Any = None
         self._k = -1  # the step to come; -1 until it is initialised
-        self.said = ""  # its last message
+        self.message = ""  # its last message
 
     def begin(self, settings: Settings) -> list[float]:
         """Start anew with these parameters; the outputs at time 0."""
@@ -67,9 +67,9 @@ class Host:
         self.change(settings)
         self._unit.enterInitializationMode()
         self._unit.exitInitializationMode()
-        found = self._read()
+        outputs = self._read()
         self._k = 0
-        return found
+        return outputs
 
     def change(self, settings: Settings) -> None:
         """Set parameters, those of a running unit too."""
@@ -93,14 +93,14 @@ class Host:
 
     def describe_failure(self, error: Exception) -> str:
         """When and how a call failed, with the last message of the unit."""
-        said = f"; its message: {self.said}" if self.said else ""
+        message = f"; its message: {self.message}" if self.message else ""
         tool = "; it needs the tool that made it" if self._description.coSimulation.needsExecutionTool else ""
         usual = self._description.defaultExperiment
         if self._k == 0 and usual is not None and usual.stepSize:
             tool += f"; the steps that it suggests are of {usual.stepSize} s, controller.period"
-        if "Failed to instantiate" in str(error) and not said:
-            said = "; the guid, or instantiationToken, in its modelDescription.xml may not be that of its binary"
-        return f"{str(error).rstrip('.')} at {max(self._k, 0) * self._cycle:.6g} s{said}{tool}"
+        if "Failed to instantiate" in str(error) and not message:
+            message = "; the guid, or instantiationToken, in its modelDescription.xml may not be that of its binary"
+        return f"{str(error).rstrip('.')} at {max(self._k, 0) * self._cycle:.6g} s{message}{tool}"
 
     def _instantiate(self) -> None:
         from fmpy import fmi1  # the base of all versions
@@ -120,16 +120,16 @@ class Host:
             getattr(self._unit, f"set{kind}")(references, exact)
 
     def _read(self) -> list[float]:
-        found = [0.0] * self._count
+        outputs = [0.0] * self._count
         for kind, (places, references) in self._outputs.items():
             for i, value in zip(places, getattr(self._unit, f"get{kind}")(references), strict=True):
-                found[i] = float(value)
-        return found
+                outputs[i] = float(value)
+        return outputs
 
     def _log(self, *words: Any) -> None:
         """A message of the unit; its text is the last argument in both versions."""
-        self.said = " ".join(words[-1].decode(errors="replace").split())
-        print(self.said, file=sys.stderr, flush=True)
+        self.message = " ".join(words[-1].decode(errors="replace").split())
+        print(self.message, file=sys.stderr, flush=True)
 
 
 def serve(connection: Connection) -> None:

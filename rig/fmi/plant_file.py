@@ -70,33 +70,37 @@ def load_fmu_plant(path: Path) -> Plant:
     table = tables.get("plant")
     if not isinstance(table, dict) or not isinstance(table.get("file"), str):
         raise place.at("plant").refuse('a table [plant] with file = "NAME.fmu"')
-    own = {f"{group}.{field}": value for group, fields in tables.items() if isinstance(fields, dict)
-           for field, value in fields.items() if isinstance(value, int | float)}  # checked with the model's
-    return declare_plant(path.parent / table["file"], table, place.at("plant"), str(path), own)
+    file_values = {f"{group}.{field}": value for group, fields in tables.items() if isinstance(fields, dict)
+                   for field, value in fields.items() if isinstance(value, int | float)}  # checked with the model's
+    return declare_plant(path.parent / table["file"], table, place.at("plant"), str(path), file_values)
 
 
-def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, own: Mapping[str, float] = {}) -> Plant:
-    """The plant of the unit in `file` as `table` maps it; `key` is what models call it, `own` the file's parameters.
+def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str,
+                  file_values: Mapping[str, float] = {}) -> Plant:
+    """The plant of the unit in `file` as `table` maps it; `key` is what models call it.
+
+    `file_values`: parameters in the TOML file.
 
     Raises:
         InputError: see `load_fmu_plant`.
     """
     about = read_description(file)
-    known = ("file", "seed", "inputs", "outputs", "parameters")
+    table_keys = ("file", "seed", "inputs", "outputs", "parameters")
     for name in table:
-        place.at(name).require(name in known, f"one of {', '.join(known)}")
+        place.at(name).require(name in table_keys, f"one of {', '.join(table_keys)}")
     inputs, outputs, parameters = (
         dict(_list_entries(table[name], place.at(name))) if name in table else _guess_entries(about, name, place)
-        for name in known[2:])
-    has = ", ".join(f"{v.causality} {n}" for n, v in about.variables.items() if v.causality in ("input", "output"))
+        for name in table_keys[2:])
+    variable_list = ", ".join(f"{v.causality} {n}" for n, v in about.variables.items()
+                              if v.causality in ("input", "output"))
     place.require(inputs and outputs,
-                  f"tables [plant.inputs] and [plant.outputs], SIGNAL = VARIABLE; the unit has {has}")
-    given = [_map_signal(about, name, *entry, "input") for name, entry in inputs.items()]
-    shown = [_map_signal(about, name, *entry, "output") for name, entry in outputs.items()]
-    place.at("inputs").require(sorted(s.role for s, _ in given) in (["drive"], ["drive", "load"]),
+                  f"tables [plant.inputs] and [plant.outputs], SIGNAL = VARIABLE; the unit has {variable_list}")
+    input_ports = [_map_signal(about, name, *entry, "input") for name, entry in inputs.items()]
+    output_ports = [_map_signal(about, name, *entry, "output") for name, entry in outputs.items()]
+    place.at("inputs").require(sorted(s.role for s, _ in input_ports) in (["drive"], ["drive", "load"]),
                                'one signal that drives the plant, and at most one of role = "load"')
-    given.sort(key=lambda item: item[0].role)
-    first, drive = shown[0][0], given[0][0]
+    input_ports.sort(key=lambda item: item[0].role)
+    first, drive = output_ports[0][0], input_ports[0][0]
     command = EHA.command if first.name == EHA.controlled.name else Signal(
         "demand", f"{first.symbol}_c", first.unit, f"demand of {first.quantity}", "command")
     groups: dict[str, dict[str, Any]] = {}
@@ -105,10 +109,10 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, 
              ] if "seed" in table or (not table and "seed" in about.variables) else []
     for name, (entry, where) in parameters.items():
         port, quantity, start = _map_parameter(about, name, entry, where)
-        values[name] = own.get(name, start)
-        where.require(name in own or not quantity.refuses(start), f"a start value of {entry.variable} in the unit, or "
-                      f"{name} in this file: {quantity.expected}; the unit has "
-                      f"{about.variables[entry.variable].start or 'none'}")
+        values[name] = file_values.get(name, start)
+        where.require(name in file_values or not quantity.refuses(start),
+                      f"a start value of {entry.variable} in the unit, or {name} in this file: {quantity.expected}; "
+                      f"the unit has {about.variables[entry.variable].start or 'none'}")
         group, _, field = name.partition(".")
         groups.setdefault(group, {})[field] = Annotated[float, quantity]
         ports.append(port)
@@ -121,15 +125,15 @@ def declare_plant(file: Path, table: Mapping[str, Any], place: Place, key: str, 
     types["controller"] = law if is_usual else convert_group_unit(law, EHA.drive.unit, drive.unit, inf)
     values |= {name: value for name, value in find_plant("eha").nominal.items()
                if name == "controller.period" or (is_usual and name.startswith("controller."))}
-    values["controller.period"] = own.get("controller.period", values["controller.period"])
+    values["controller.period"] = file_values.get("controller.period", values["controller.period"])
     values.setdefault("controller.current_limit", 1e9)  # of a drive in another unit none is known
-    state = make_state_type(tuple(signal.name for signal, _ in shown))
-    columns = (command, first, drive, *(s for s, _ in shown[1:]), *(s for s, _ in given[1:]))
+    state = make_state_type(tuple(signal.name for signal, _ in output_ports))
+    columns = (command, first, drive, *(s for s, _ in output_ports[1:]), *(s for s, _ in input_ports[1:]))
     # the unit keeps its step to itself; its state is what it has shown
     return keep_plant(Plant(
         signals=cast(Any, columns), parameters=types, state=state, step=lambda s, m, u, p: (s, m),
         measure=lambda s, p: s, moves=(), title=f"FMU {file.name}", name=file.stem, values=values, file=file, key=key,
-        foreign=partial(Unit, about, [port for _, port in given], [port for _, port in shown], ports)))
+        foreign=partial(Unit, about, [port for _, port in input_ports], [port for _, port in output_ports], ports)))
 
 
 def make_state_type(names: tuple[str, ...]) -> type[Any]:
@@ -154,11 +158,11 @@ def _list_entries(table: object, place: Place, prefix: str = "") -> Iterator[tup
 
 def _guess_entries(about: Description, table: str, place: Place) -> Entries:
     """Variables with names of signals of the EHA; as parameters those with one dot in their name and a start value."""
-    known = {*_COLUMNS.values()} - {"com"}
+    signal_names = {*_COLUMNS.values()} - {"com"}
     return {name: (Entry(name), place) for name, v in about.variables.items()
             if v.causality == table.removesuffix("s") and v.type in ("Real", "Float64")
             and (v.start is not None and re.fullmatch(r"(?!controller\b)\w+\.\w+", name) if table == "parameters" else
-                 _COLUMNS.get(name, name) in known)}
+                 _COLUMNS.get(name, name) in signal_names)}
 
 
 def _map_signal(about: Description, name: str, entry: Entry, place: Place, causality: str) -> tuple[Signal, Port]:
@@ -178,22 +182,22 @@ def _map_signal(about: Description, name: str, entry: Entry, place: Place, causa
 
 def _find_worth(about: Description, entry: Entry, unit: str, place: Place) -> tuple[float, str]:
     """What one of a variable is worth, and the SI unit; `unit` is that of the signal, "" if it has none of its own."""
-    stated = _find_attribute(about, entry.variable, "unit") or ""
+    variable_unit = _find_attribute(about, entry.variable, "unit") or ""
     if entry.count is not None:
-        number, _, named = entry.count.partition(" ")
-        known = find_unit(named)
-        si = unit or (known.si if known else named or "1")
-        count, of = (entry.count, si) if unit or known is not None else (number, "")
+        number, _, unit_name = entry.count.partition(" ")
+        definition = find_unit(unit_name)
+        si = unit or (definition.si if definition else unit_name or "1")
+        count, of = (entry.count, si) if unit or definition is not None else (number, "")
         worth = float(parse_quantity(count, of, place.at("count")))
         place.at("count").require(worth, "a number other than 0")
         return worth, si
-    known = find_unit(stated)
-    own = unit or (known.si if known else "")
-    if own and (fitting := fit_unit(stated, own)) is not None:
-        return float(fitting.factor), fitting.si
-    if unit and stated not in ("", unit):
-        raise place.refuse(f'count = ".. {unit}": the variable {entry.variable} is in {stated}')
-    return 1.0, unit or stated or "1"
+    definition = find_unit(variable_unit)
+    si_unit = unit or (definition.si if definition else "")
+    if si_unit and (conversion := fit_unit(variable_unit, si_unit)) is not None:
+        return float(conversion.factor), conversion.si
+    if unit and variable_unit not in ("", unit):
+        raise place.refuse(f'count = ".. {unit}": the variable {entry.variable} is in {variable_unit}')
+    return 1.0, unit or variable_unit or "1"
 
 
 def _map_parameter(about: Description, name: str, entry: Entry, place: Place) -> tuple[Port, Quantity, float]:
