@@ -67,7 +67,7 @@ def check_mandatory_objects(t: Target) -> str:
 
 def check_lists(t: Target) -> str:
     """The three lists name exactly the objects that are described."""
-    listed: list[int] = []
+    listed_indices: list[int] = []
     problems = []
     for name, permitted in LISTS.items():
         keys = t.sheet.text.options(name) if t.sheet.text.has_section(name) else []
@@ -75,14 +75,14 @@ def check_lists(t: Target) -> str:
         if (count := read_number(t, name, "SupportedObjects")) != len(entries):
             problems.append(f"{name} says {count} and lists {len(entries)}")
         problems += [f"0x{index:04X} in {name}" for index in entries if index not in permitted]
-        listed += entries
-    described = {int(section, 16) for section in list_described(t)}
+        listed_indices += entries
+    described_indices = {int(section, 16) for section in list_described(t)}
     problems += [
-        *(f"0x{index:04X} is listed twice" for index in sorted(set(listed)) if listed.count(index) > 1),
-        *(f"0x{index:04X} is listed and not described" for index in sorted(set(listed) - described)),
-        *(f"0x{index:04X} is described and not listed" for index in sorted(described - set(listed)))]
+        *(f"0x{index:04X} is listed twice" for index in sorted(set(listed_indices)) if listed_indices.count(index) > 1),
+        *(f"0x{index:04X} is listed and not described" for index in sorted(set(listed_indices) - described_indices)),
+        *(f"0x{index:04X} is described and not listed" for index in sorted(described_indices - set(listed_indices)))]
     require(not problems, join_labels(problems))
-    return f"{len(listed)} objects in the lists"
+    return f"{len(listed_indices)} objects in the lists"
 
 
 def list_arrays(t: Target) -> list[int]:
@@ -94,8 +94,8 @@ def list_arrays(t: Target) -> list[int]:
 def check_subindices(t: Target, index: int) -> None:
     """Arrays and records say how many sub-indices they have, in two places."""
     variables = t.sheet.objects[index]
-    stated, subs = read_number(t, f"{index:04X}", "SubNumber", -1), [variable.sub for variable in variables]
-    require(stated == len(subs), f"0x{index:04X} says SubNumber {stated} and has {len(subs)}")
+    sub_number, subs = read_number(t, f"{index:04X}", "SubNumber", -1), [variable.sub for variable in variables]
+    require(sub_number == len(subs), f"0x{index:04X} says SubNumber {sub_number} and has {len(subs)}")
     require(0 in subs, f"0x{index:04X} has no sub 0")
     highest = t.sheet.default(index)
     counts_used = index == HISTORY or variables[0].is_mapping  # sub 0 counts what is in use
@@ -145,7 +145,7 @@ def check_standard(t: Target, variable: Variable) -> None:
 def check_pdo_parameters(t: Target) -> str:
     """Communication and mapping parameters come in pairs."""
     pdos = t.sheet.pdos
-    known = {pdo.mapping for pdo in pdos}
+    mappings = {pdo.mapping for pdo in pdos}
     counts = [(key, read_number(t, "DeviceInfo", key, -1), sum(pdo.is_received is is_received for pdo in pdos))
               for key, is_received in (("NrOfRXPDO", True), ("NrOfTXPDO", False))]
     problems = [
@@ -153,8 +153,8 @@ def check_pdo_parameters(t: Target) -> str:
           if t.sheet.find(pdo.parameter, sub) is None),
         *(f"{pdo.name} has no mapping 0x{pdo.mapping:04X}" for pdo in pdos if pdo.mapping not in t.sheet.objects),
         *(f"{variable.label} maps a PDO that is not there" for variable in t.sheet.variables
-          if variable.is_mapping and variable.sub == 0 and variable.index not in known),
-        *(f"{key} is {stated}, {count} are described" for key, stated, count in counts if stated != count)]
+          if variable.is_mapping and variable.sub == 0 and variable.index not in mappings),
+        *(f"{key} is {number}, {count} are described" for key, number, count in counts if number != count)]
     require(not problems, join_labels(problems))
     return f"{len(pdos)} PDOs"
 
@@ -163,10 +163,12 @@ def check_pdo_mapping(t: Target, pdo: Pdo) -> str:
     """The default mappings name objects that can be mapped."""
     subs = range(1, (t.sheet.default(pdo.mapping) or 0) + 1)
     words = [t.sheet.default(pdo.mapping, sub) or 0 for sub in subs]
-    for mapped in filter(None, (t.sheet.find(*split_entry(word)[:2]) for word in words)):
-        can_be_carried = mapped.is_writable if pdo.is_received else mapped.is_readable
-        require(can_be_carried and mapped.is_mappable and mapped.access != ("rwr" if pdo.is_received else "rww"),
-                f"{pdo.name} maps {mapped.label}, which is {mapped.access} with PDOMapping={mapped.is_mappable:d}")
+    for variable in filter(None, (t.sheet.find(*split_entry(word)[:2]) for word in words)):
+        can_be_carried = variable.is_writable if pdo.is_received else variable.is_readable
+        require(can_be_carried and variable.is_mappable
+                and variable.access != ("rwr" if pdo.is_received else "rww"),
+                f"{pdo.name} maps {variable.label}, which is {variable.access} with PDOMapping="
+                f"{variable.is_mappable:d}")
     return describe_mapping(t, pdo, words)
 
 
@@ -176,9 +178,9 @@ def check_identity(t: Target) -> str:
     if not vendor:
         raise CaseFailed(f"the vendor-ID is {'not given' if vendor is None else vendor}, which is invalid")
     for sub, key in ((1, "VendorNumber"), (2, "ProductNumber"), (3, "RevisionNumber")):
-        value, stated = t.sheet.default(0x1018, sub), read_number(t, "DeviceInfo", key, -1)
-        require(value in (None, stated), f"0x1018:{sub} is 0x{value or 0:X}, {key} is "
-                                         f"{f'0x{stated:X}' if stated >= 0 else 'not given'}")
+        value, number = t.sheet.default(0x1018, sub), read_number(t, "DeviceInfo", key, -1)
+        require(value in (None, number), f"0x1018:{sub} is 0x{value or 0:X}, {key} is "
+                                         f"{f'0x{number:X}' if number >= 0 else 'not given'}")
     reserved = " (reserved by CiA: no vendor's)" if 0xAFFF0000 <= vendor <= 0xFFFEFFFF or vendor >= 0xFFFF1000 else ""
     return f"vendor-ID 0x{vendor:08X}{reserved}"
 
@@ -187,14 +189,14 @@ def check_identifiers(t: Target) -> str:
     """COB-IDs as they are after a reset."""
     words = [*((pdo.name, t.sheet.default(pdo.parameter, 1), not pdo.is_received) for pdo in t.sheet.pdos),
              ("SYNC", t.sheet.default(0x1005), False), ("EMCY", t.sheet.default(0x1014), True)]
-    used = [(name, word & 0x7FF, is_sent) for name, word, is_sent in words
-            if word is not None and (name == "SYNC" or not word & INVALID)]
+    cob_ids = [(name, word & 0x7FF, is_sent) for name, word, is_sent in words
+               if word is not None and (name == "SYNC" or not word & INVALID)]
     problems = [
-        *(f"{name} uses 0x{can_id:03X}, which is restricted" for name, can_id, _ in used if is_restricted(can_id)),
-        *(f"{second[0]} and {first[0]} send 0x{first[1]:03X}" for first, second in combinations(used, 2)
+        *(f"{name} uses 0x{can_id:03X}, which is restricted" for name, can_id, _ in cob_ids if is_restricted(can_id)),
+        *(f"{second[0]} and {first[0]} send 0x{first[1]:03X}" for first, second in combinations(cob_ids, 2)
           if first[1:] == second[1:] and first[2])]
     require(not problems, join_labels(problems))
-    return f"{len(used)} COB-IDs"
+    return f"{len(cob_ids)} COB-IDs"
 
 
 def list_described(t: Target) -> list[str]:
@@ -204,8 +206,8 @@ def list_described(t: Target) -> list[str]:
 
 def read_number(t: Target, section: str, key: str, absent: int = 0) -> int:
     """A number in the file. Raises CaseFailed for one that cannot be read."""
-    found = next((each for each in t.sheet.text.sections() if each.upper() == section.upper()), "")
-    text = t.sheet.text.get(found, key, fallback="").strip()
+    name = next((each for each in t.sheet.text.sections() if each.upper() == section.upper()), "")
+    text = t.sheet.text.get(name, key, fallback="").strip()
     try:
         return int(text, 0) if text else absent
     except ValueError:

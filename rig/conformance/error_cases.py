@@ -50,8 +50,8 @@ LIMIT = 200  # ms, of the supervision that the tester sets
 def check_identifier(t: Target, index: int) -> str:
     """The COB-ID of SYNC (0x1005) or EMCY (0x1014), where the node has it; only that of EMCY can be valid or not."""
     variable, word = t.variable(index), t.read(*t.variable(index).key)
-    expected, text = t.sheet.default(index), f"0x{word & 0x7FF:03X}"
-    require(expected in (word, None), f"0x{word:08X}, the EDS says 0x{expected or 0:08X}")
+    default, text = t.sheet.default(index), f"0x{word & 0x7FF:03X}"
+    require(default in (word, None), f"0x{word:08X}, the EDS says 0x{default or 0:08X}")
     require(variable.has_valid_bit or not word & EXTENDED, f"0x{word:08X} asks for a 29-bit identifier")
     if not variable.is_writable:
         return f"{text}, {variable.access}"
@@ -94,8 +94,8 @@ def check_error_reset(t: Target) -> str:
         t.wait(t.options.timeout, lambda: 0 in list_codes(t, mark))
         require(0 in list_codes(t, mark), "no EMCY 0x0000")
         register = t.read(0x1001)
-    said = [frame.data[2] for frame in t.heard(mark, t.emcy_id) if read_error_code(frame) == 0][-1]
-    require(said == register, f"the frame says 0x{said:02X}, 0x1001 is 0x{register:02X}")
+    frame_register = [frame.data[2] for frame in t.heard(mark, t.emcy_id) if read_error_code(frame) == 0][-1]
+    require(frame_register == register, f"the frame says 0x{frame_register:02X}, 0x1001 is 0x{register:02X}")
     require(register == 0, f"0x1001 is still 0x{register:02X}")
     return f"EMCY 0x0000, register 0x{register:02X}"
 
@@ -161,10 +161,10 @@ def check_heartbeat_lost(t: Target) -> str:
     last = beat_as(t, watch(t), 10)
     frames = t.wait_for_error(LIMIT / 1e3 + t.options.timeout, HEARTBEAT_LOST)
     require(frames, f"no EMCY 0x8130 within {LIMIT / 1e3 + t.options.timeout:g} s")
-    elapsed, tolerance = (frames[0].t_ns - last) * 1e-6, 1e3 * t.options.tolerance
-    require(elapsed >= LIMIT - tolerance, f"after {elapsed:.0f} ms, the consumer time is {LIMIT} ms")
-    require(elapsed <= 1.5 * LIMIT + tolerance, f"after {elapsed:.0f} ms, limit {1.5 * LIMIT + tolerance:.0f} ms")
-    return f"after {elapsed:.0f} ms, consumer time {LIMIT} ms"
+    delay, tolerance = (frames[0].t_ns - last) * 1e-6, 1e3 * t.options.tolerance
+    require(delay >= LIMIT - tolerance, f"after {delay:.0f} ms, the consumer time is {LIMIT} ms")
+    require(delay <= 1.5 * LIMIT + tolerance, f"after {delay:.0f} ms, limit {1.5 * LIMIT + tolerance:.0f} ms")
+    return f"after {delay:.0f} ms, consumer time {LIMIT} ms"
 
 
 def check_heartbeat_kept(t: Target) -> str:

@@ -103,7 +103,7 @@ def check_pdo_by_state(t: Target, state: NmtState) -> str:
     Whether it is noticed there is the subject of another test: a node that is silent shows nothing here.
     """
     pdos = {identify(t, pdo): pdo for pdo in list_valid(t)}
-    cyclic = {cob_id for cob_id, pdo in pdos.items() if not pdo.is_received and set_type(t, pdo, 1)}
+    cyclic_ids = {cob_id for cob_id, pdo in pdos.items() if not pdo.is_received and set_type(t, pdo, 1)}
     values = {cob_id: read_mapped(t, pdo) for cob_id, pdo in pdos.items() if pdo.is_received}
     is_running = state == OPERATIONAL
     t.beat()
@@ -113,12 +113,12 @@ def check_pdo_by_state(t: Target, state: NmtState) -> str:
         t.send(cob_id, b"".join(each))
     t.sync(3, 0.02)
     if is_running:
-        t.wait(t.options.timeout, lambda: {frame.cob_id for frame in t.heard(mark)} >= cyclic)
+        t.wait(t.options.timeout, lambda: {frame.cob_id for frame in t.heard(mark)} >= cyclic_ids)
     t.wait(0.05)
-    sent = {frame.cob_id for frame in t.heard(mark)} & set(pdos)
-    silent = [pdos[cob_id].name for cob_id in cyclic - sent]
+    sent_ids = {frame.cob_id for frame in t.heard(mark)} & set(pdos)
+    silent = [pdos[cob_id].name for cob_id in cyclic_ids - sent_ids]
     require(not (is_running and silent), f"OPERATIONAL: {join_labels(silent)} not sent at SYNC")
-    early = [pdos[cob_id].name for cob_id in sent]
+    early = [pdos[cob_id].name for cob_id in sent_ids]
     require(is_running or not early, f"{name_state(state)}: {join_labels(early)} sent")
     if t.sheet.find(0x1014) and values and state != STOPPED:  # in STOPPED no EMCY could say so
         cob_id, each = next(iter(values.items()))
@@ -126,8 +126,8 @@ def check_pdo_by_state(t: Target, state: NmtState) -> str:
         require(is_running or not is_noticed, f"{name_state(state)}: {pdos[cob_id].name} is received")
         t.send(cob_id, b"".join(each))
         if is_running and not is_noticed:
-            return f"{name_state(state)} {len(sent)} sent, reception not shown"
-    return f"{name_state(state)} {len(sent)} sent"
+            return f"{name_state(state)} {len(sent_ids)} sent, reception not shown"
+    return f"{name_state(state)} {len(sent_ids)} sent"
 
 
 def check_emcy_by_state(t: Target) -> str:
@@ -169,14 +169,14 @@ def check_reset_node(t: Target) -> str:
 def check_restored(t: Target, specifier: NmtCommand, variable: Variable) -> str:
     """Change an object, reset, and compare with its default."""
     data = t.upload(*variable.key)
-    offered = variable.change(data)
+    new_data = variable.change(data)
     with t.restore_afterwards(variable.key):
-        t.download(*variable.key, offered)
-        t.require_value(variable, offered, "does not change")
+        t.download(*variable.key, new_data)
+        t.require_value(variable, new_data, "does not change")
         t.reset(specifier)
-        expected = data if variable.default_bytes is None else variable.default_bytes
-        t.require_value(variable, expected, f"has not its default {variable.show(expected)} after the reset")
-    return f"{variable.label}: {variable.decode(offered)} to {variable.decode(expected)}"
+        default = data if variable.default_bytes is None else variable.default_bytes
+        t.require_value(variable, default, f"has not its default {variable.show(default)} after the reset")
+    return f"{variable.label}: {variable.decode(new_data)} to {variable.decode(default)}"
 
 
 def check_reset_from_state(t: Target, reset: tuple[NmtState, NmtCommand]) -> None:
@@ -218,10 +218,10 @@ def check_sync_response(t: Target) -> str:
             start, mark = t.now(), len(t.frames)
             t.sync()
             t.wait(t.options.timeout, lambda: {frame.cob_id for frame in t.heard(mark)} >= set(ids))  # noqa: B023
-            arrived = {frame.cob_id: (frame.t_ns - start) * 1e-6 for frame in t.heard(mark, *ids)}
-            missing = [name for cob_id, name in ids.items() if cob_id not in arrived]
+            delays = {frame.cob_id: (frame.t_ns - start) * 1e-6 for frame in t.heard(mark, *ids)}
+            missing = [name for cob_id, name in ids.items() if cob_id not in delays]
             require(not missing, f"no {', '.join(missing)} after a SYNC")
-            times += arrived.values()
+            times += delays.values()
             t.wait(max(0.0, 0.02 - (t.now() - start) * 1e-9))
     return f"{', '.join(ids.values())}: {require_times(t, times, 0.99, window or 10.0)}"
 

@@ -59,12 +59,12 @@ def list_readable(t: Target) -> list[Variable]:
 
 
 def read_values(t: Target, is_wanted: Callable[[Variable], object],
-                ignored: type[CaseFailed] = Refusal) -> Iterator[Value]:
-    """The readable objects that are wanted, and what each holds; without those whose reading ends as is ignored."""
+                problem: type[CaseFailed] = Refusal) -> Iterator[Value]:
+    """The readable objects that are wanted, and what each holds; without those whose reading ends with `problem`."""
     for variable in filter(is_wanted, list_readable(t)):
         try:
             data = t.upload(*variable.key)
-        except ignored:
+        except problem:
             continue
         yield variable, data
 
@@ -89,8 +89,8 @@ def check_limits(t: Target, value: Value) -> None:
 
 def check_default(t: Target, variable: Variable) -> None:
     """It holds what the EDS says."""
-    data, expected = t.upload(*variable.key), variable.default_bytes or b""
-    require(data == expected, f"{variable.label} is {variable.show(data)}, the EDS says {variable.show(expected)}")
+    data, default = t.upload(*variable.key), variable.default_bytes or b""
+    require(data == default, f"{variable.label} is {variable.show(data)}, the EDS says {variable.show(default)}")
 
 
 def list_constants(t: Target) -> list[Variable]:
@@ -109,8 +109,8 @@ def list_reset(t: Target) -> list[Variable]:
 
 def check_highest_sub(t: Target, variables: list[Variable]) -> None:
     """Arrays and records say how many sub-indices they have."""
-    found, highest = t.read(variables[0].index), variables[-1].sub
-    require(found == highest, f"0x{variables[0].index:04X}:0 is {found}, the highest sub-index is {highest}")
+    count, highest = t.read(variables[0].index), variables[-1].sub
+    require(count == highest, f"0x{variables[0].index:04X}:0 is {count}, the highest sub-index is {highest}")
 
 
 def offer_unknown_objects(t: Target) -> Iterator[Offer]:
@@ -176,8 +176,8 @@ def offer_values_out_of_range(t: Target) -> Iterator[Offer]:
     for variable, data in read_writable_numbers(t):
         for limit, step, code in ((variable.high, 1, TOO_HIGH), (variable.low, -1, TOO_LOW)):
             if limit is not None and variable.can_hold(limit + step):
-                offered = variable.encode(limit + step)
-                yield Offer(f"{variable.label} = {limit + step}", variable.key, offered, (VALUE, code), data)
+                wrong_data = variable.encode(limit + step)
+                yield Offer(f"{variable.label} = {limit + step}", variable.key, wrong_data, (VALUE, code), data)
 
 
 def check_name(t: Target, index: int) -> str:

@@ -48,10 +48,10 @@ def describe_mapping(t: Target, pdo: Pdo, words: Sequence[int]) -> str:
     for index, sub, bits in map(split_entry, words):
         if 0 < index < 0x20:  # a dummy entry
             continue
-        name, mapped = f"{pdo.name} maps 0x{index:04X}:{sub:X}", t.sheet.find(index, sub)
-        if mapped is None:
+        name, variable = f"{pdo.name} maps 0x{index:04X}:{sub:X}", t.sheet.find(index, sub)
+        if variable is None:
             raise Problem(f"{name}, which is not there")
-        require(mapped.bits == bits, f"{name} with {bits} bits, it has {mapped.bits}")
+        require(variable.bits == bits, f"{name} with {bits} bits, it has {variable.bits}")
     total = sum(split_entry(word)[2] for word in words)
     require(total <= 64, f"{pdo.name} has {total} bits")
     return f"{pdo.name} {total} bits"
@@ -59,18 +59,18 @@ def describe_mapping(t: Target, pdo: Pdo, words: Sequence[int]) -> str:
 
 def check_cyclic(t: Target, pdo: Pdo) -> str:
     """Six SYNCs for each type that the node accepts."""
-    accepted = []
+    types = []
     for kind in (1, 2, 3):
         if not set_type(t, pdo, kind):
             continue
-        accepted.append(str(kind))
+        types.append(str(kind))
         with operational(t):
-            frames = answer_syncs(t, identify(t, pdo), 6, expected=6 // kind)
+            frames = answer_syncs(t, identify(t, pdo), 6, expected_count=6 // kind)
         require(len(frames) == 6 // kind, f"{pdo.name}, type {kind}: frames at 6 SYNCs: {len(frames)}")
         wrong = [len(frame.data) for frame in frames if len(frame.data) != count_bytes(t, pdo)]
         require(not wrong, f"{pdo.name}: {wrong[:1]} bytes, the mapping has {count_bytes(t, pdo)}")
-    require_applicable(accepted, "no TPDO accepts a synchronous type")
-    return f"{pdo.name} types {', '.join(accepted)}"
+    require_applicable(types, "no TPDO accepts a synchronous type")
+    return f"{pdo.name} types {', '.join(types)}"
 
 
 def check_acyclic(t: Target, pdo: Pdo) -> str:
@@ -79,7 +79,7 @@ def check_acyclic(t: Target, pdo: Pdo) -> str:
     with operational(t):
         before = t.listen(SETTLE, identify(t, pdo))
         require(not before, f"{pdo.name}: frames without SYNC: {len(before)}")
-        frames = answer_syncs(t, identify(t, pdo), 4, expected=0)
+        frames = answer_syncs(t, identify(t, pdo), 4, expected_count=0)
     require(len(frames) <= 4, f"{pdo.name}: {len(frames)} frames at 4 SYNCs")
     return f"{pdo.name} {len(frames)} at 4 SYNCs"
 
@@ -120,8 +120,8 @@ def check_extended(t: Target, pdo: Pdo) -> str:
         t.try_download(pdo.parameter, 1, word | INVALID)
         code = t.try_download(pdo.parameter, 1, INVALID | wide)
         require_abort(code, (0, VALUE), pdo.name)
-        kept = t.read(pdo.parameter, 1)
-        require(code or kept & 0x3FFFFFFF == wide, f"{pdo.name} accepts it and holds 0x{kept:08X}")
+        new_word = t.read(pdo.parameter, 1)
+        require(code or new_word & 0x3FFFFFFF == wide, f"{pdo.name} accepts it and holds 0x{new_word:08X}")
     return f"{pdo.name} {'refused' if code else 'supported'}"
 
 
@@ -133,8 +133,8 @@ def check_switching(t: Target, pdo: Pdo, phases: Sequence[tuple[str, str, bool]]
         require_type(t, pdo, 1)
     word, free, values = t.read(pdo.parameter, 1), t.find_free_identifier(), read_mapped(t, pdo)
     cob_ids = {"old": word & 0x7FF, "new": free}
-    moved = word & ~0x7FF | free
-    words = {"on": (word,), "off": (word | INVALID,), "moved": (word | INVALID, moved | INVALID, moved)}
+    new_word = word & ~0x7FF | free
+    words = {"on": (word,), "off": (word | INVALID,), "moved": (word | INVALID, new_word | INVALID, new_word)}
     with operational(t), t.restore_afterwards((pdo.parameter, 1)):
         for action, name, is_expected in phases:
             for value in words[action]:
@@ -182,19 +182,19 @@ def check_long_rpdo(t: Target, pdo: Pdo) -> str:
 def check_rpdo_values(t: Target, pdo: Pdo) -> str:
     """Each number changes by the smallest step, and is set back. Only with --write."""
     require(t.options.may_write, "values are changed only with --write", CaseSkipped)
-    mapped = [t.sheet.find(*split_entry(word)[:2]) for word in read_mapping(t, pdo)]
-    readable = [variable for variable in mapped if variable is not None and variable.is_readable]
-    require_applicable(len(readable) == len(mapped), "no valid RPDO maps readable objects alone")
+    variables = [t.sheet.find(*split_entry(word)[:2]) for word in read_mapping(t, pdo)]
+    readable = [variable for variable in variables if variable is not None and variable.is_readable]
+    require_applicable(len(readable) == len(variables), "no valid RPDO maps readable objects alone")
     is_synchronous = t.read(pdo.parameter, 2) <= LAST_SYNCHRONOUS
     with operational(t):
         before = read_mapped(t, pdo)
-        other = [variable.change(data) for variable, data in zip(readable, before, strict=True)]
-        t.send(identify(t, pdo), b"".join(other))
+        new_values = [variable.change(data) for variable, data in zip(readable, before, strict=True)]
+        t.send(identify(t, pdo), b"".join(new_values))
         if is_synchronous:
             t.wait(SETTLE / 2)
             require(read_mapped(t, pdo) == before, f"{pdo.name}: the values are there before SYNC")
             t.sync()
-        has_arrived = wait_for_values(t, pdo, other)
+        has_arrived = wait_for_values(t, pdo, new_values)
         send_values(t, pdo, before)
         require(has_arrived, f"{pdo.name}: the values are not in the dictionary")
         require(wait_for_values(t, pdo, before), f"{pdo.name}: a second frame has no effect")
@@ -216,11 +216,11 @@ def check_tpdo_values(t: Target, pdo: Pdo) -> str:
             require(frames, f"{pdo.name}: no frame at a SYNC")
             at, differences = 0, []
             for word, first, second in zip(mapping, read_mapped(t, pdo), read_mapped(t, pdo), strict=True):
-                sent = frames[0].data[at:at + len(first)]
+                frame_bytes = frames[0].data[at:at + len(first)]
                 at += len(first)
-                if first == second != sent:
+                if first == second != frame_bytes:
                     label = f"0x{word >> 16:04X}:{word >> 8 & 0xFF:X}"
-                    differences.append(f"{label} was sent as {sent.hex()}, SDO reads {first.hex()}")
+                    differences.append(f"{label} was sent as {frame_bytes.hex()}, SDO reads {first.hex()}")
             wrong += differences[:1]
     require(len(wrong) <= 2, f"{pdo.name}: {join_labels(wrong, 1)}")
     return f"{pdo.name} {5 - len(wrong)} of 5"
@@ -241,8 +241,8 @@ def check_mapping_rules(t: Target, pdo: Pdo) -> str:
                                        (0x10180120, (CANNOT_MAP,), "the vendor-ID")):
                 require_abort(next(iter(write_mapping(t, pdo, [entry])), 0), codes, f"{pdo.name}, {what}")
             if t.sheet.find(pdo.mapping, copies) is not None:
-                seen = write_mapping(t, pdo, [words[0]] * copies)
-                require(PDO_TOO_LONG in seen, f"{pdo.name}, more than 64 bits: accepted")
+                abort_codes = write_mapping(t, pdo, [words[0]] * copies)
+                require(PDO_TOO_LONG in abort_codes, f"{pdo.name}, more than 64 bits: accepted")
         finally:
             write_mapping(t, pdo, words)
     return pdo.name
@@ -280,9 +280,9 @@ def write_mapping(t: Target, pdo: Pdo, words: Sequence[int]) -> list[int]:
 
 def read_mapped(t: Target, pdo: Pdo) -> list[bytes]:
     """What the mapped objects hold; zeros for what cannot be read. Raises Refusal, Problem."""
-    mapped = [(t.sheet.find(index, sub), bits) for index, sub, bits in map(split_entry, read_mapping(t, pdo))]
+    entries = [(t.sheet.find(index, sub), bits) for index, sub, bits in map(split_entry, read_mapping(t, pdo))]
     return [t.upload(*variable.key) if variable is not None and variable.is_readable else bytes(bits // 8)
-            for variable, bits in mapped]
+            for variable, bits in entries]
 
 
 def send_values(t: Target, pdo: Pdo, values: list[bytes]) -> None:
@@ -300,11 +300,11 @@ def send_short(t: Target, pdo: Pdo, values: list[bytes], cob_id: int | None = No
     An expected one is waited for longer than one that should not come.
     """
     t.send(identify(t, pdo) if cob_id is None else cob_id, b"".join(values)[:-1])
-    found = t.wait_for_error(SETTLE, TOO_SHORT)
-    if not found:  # some nodes look at a synchronous one only at SYNC
+    frames = t.wait_for_error(SETTLE, TOO_SHORT)
+    if not frames:  # some nodes look at a synchronous one only at SYNC
         t.sync()
-        found = t.wait_for_error(t.options.timeout if is_expected else SETTLE, TOO_SHORT)
-    return found
+        frames = t.wait_for_error(t.options.timeout if is_expected else SETTLE, TOO_SHORT)
+    return frames
 
 
 def wait_for_values(t: Target, pdo: Pdo, values: list[bytes]) -> bool:
@@ -317,14 +317,14 @@ def wait_for_values(t: Target, pdo: Pdo, values: list[bytes]) -> bool:
     return True
 
 
-def answer_syncs(t: Target, cob_id: int, count: int, expected: int) -> list[Frame]:
+def answer_syncs(t: Target, cob_id: int, count: int, expected_count: int) -> list[Frame]:
     """Send SYNCs, 20 ms apart; the frames of that COB-ID until shortly after the last.
 
     As many as are expected are waited for longer.
     """
     mark = len(t.frames)
     t.sync(count, 0.02)
-    t.wait(t.options.timeout, lambda: len(t.heard(mark, cob_id)) >= expected)
+    t.wait(t.options.timeout, lambda: len(t.heard(mark, cob_id)) >= expected_count)
     t.wait(SETTLE)
     return t.heard(mark, cob_id)
 
@@ -334,11 +334,11 @@ def list_valid(t: Target, is_received: bool | None = None, is_changeable: bool =
 
     Raises CaseNotApplicable if there is none.
     """
-    chosen = [pdo for pdo in t.sheet.pdos if is_received in (None, pdo.is_received)
-              and not t.read(pdo.parameter, 1) & INVALID and t.read(pdo.mapping, 0)
-              and (not is_changeable or t.sheet.is_writable(pdo.parameter, 1))]
-    require_applicable(chosen, f"no such PDO is valid{' and can get another COB-ID' if is_changeable else ''}")
-    return chosen
+    pdos = [pdo for pdo in t.sheet.pdos if is_received in (None, pdo.is_received)
+            and not t.read(pdo.parameter, 1) & INVALID and t.read(pdo.mapping, 0)
+            and (not is_changeable or t.sheet.is_writable(pdo.parameter, 1))]
+    require_applicable(pdos, f"no such PDO is valid{' and can get another COB-ID' if is_changeable else ''}")
+    return pdos
 
 
 def require_fixed(t: Target, key: tuple[int, int]) -> str:
@@ -347,14 +347,14 @@ def require_fixed(t: Target, key: tuple[int, int]) -> str:
     with t.restore_afterwards(key):
         code = t.try_download(*key, word & ~0x7FF | free)
         text = f"{t.variable(*key).label} 0x{word & 0x7FF:03X} to 0x{free:03X}"
-        said = require_abort(code, (VALUE, STATE, 0x08000020, 0x08000021, 0x06010000), text)
+        abort = require_abort(code, (VALUE, STATE, 0x08000020, 0x08000021, 0x06010000), text)
         require(t.read(*key) == word, f"{text} has changed all the same")
-    return said
+    return abort
 
 
 def require_unrestricted(t: Target, key: tuple[int, int]) -> None:
     """A COB-ID refuses every restricted identifier with 0x06090030, even while it is off. Raises Problem."""
-    word, accepted = t.read(*key), []
+    word, problems = t.read(*key), []
     is_switchable = t.variable(*key).has_valid_bit
     base = word & ~(0x7FF | (INVALID if is_switchable else PRODUCER))
     with t.restore_afterwards(key):
@@ -362,8 +362,8 @@ def require_unrestricted(t: Target, key: tuple[int, int]) -> None:
             if is_switchable:
                 require_abort(t.try_download(*key, word | INVALID), (0,), "it cannot be switched off")
             if (code := t.try_download(*key, base | can_id)) != VALUE:
-                accepted.append(f"0x{can_id:03X} {format_abort(code)}")
-    require(not accepted, f"{t.variable(*key).label}: {join_labels(accepted)}")
+                problems.append(f"0x{can_id:03X} {format_abort(code)}")
+    require(not problems, f"{t.variable(*key).label}: {join_labels(problems)}")
 
 
 def require_emcy(t: Target) -> None:

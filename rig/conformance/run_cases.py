@@ -40,9 +40,9 @@ class Outcome(NamedTuple):
         return "INVALID_TIMING" if self.is_disturbed else "PASS"
 
 
-def choose_cases(wanted: Sequence[str]) -> list[Case]:
+def choose_cases(words: Sequence[str]) -> list[Case]:
     """The cases of these chapters ("3") and numbers ("3.6"); all for none. Unknown words choose nothing."""
-    return [each for each in CASES if not wanted or each.number in wanted or str(each.chapter) in wanted]
+    return [each for each in CASES if not words or each.number in words or str(each.chapter) in words]
 
 
 def run_cases(target: Target, cases: Sequence[Case] = CASES, progress: Progress = ignore_progress) -> Outcome:
@@ -55,29 +55,29 @@ def run_cases(target: Target, cases: Sequence[Case] = CASES, progress: Progress 
     if is_live:
         _require_present(target)
     snapshot = _read_all(target) if is_live else {}
-    judged = []
+    results = []
     for position, each in enumerate(cases):
         progress(CHAPTERS[each.chapter], position / len(cases))
-        judged.append(_run_case(target, each))
+        results.append(_run_case(target, each))
     notes = [*_restore(target, snapshot)] if is_live else []
     if target.others:
         notes.append(f"Other nodes on the bus: {', '.join(map(str, sorted(target.others)))}.")
-    return Outcome([result for result, _ in judged], notes, any(is_disturbed for _, is_disturbed in judged))
+    return Outcome([result for result, _ in results], notes, any(is_disturbed for _, is_disturbed in results))
 
 
 def _run_case(target: Target, each: Case, attempts: int = 3) -> tuple[Result, bool]:
     """One case, several times if it fails while the tester is late; and whether that kept it from a verdict."""
     start = target.now()
     for _ in range(attempts):
-        verdict, measured = _attempt(target, each)
+        verdict, text = _attempt(target, each)
         is_disturbed = target.stall > max(0.5 * target.options.tolerance, 0.002) and verdict is Verdict.FAIL
         if not is_disturbed:
             break
     is_disturbed &= each.is_timed
     if is_disturbed:
         verdict = Verdict.SKIPPED
-        measured = f"this machine was {1e3 * target.stall:.0f} ms late itself while it measured: {measured}"
-    return Result(each, measured, verdict, (target.now() - start) * 1e-9), is_disturbed
+        text = f"this machine was {1e3 * target.stall:.0f} ms late itself while it measured: {text}"
+    return Result(each, text, verdict, (target.now() - start) * 1e-9), is_disturbed
 
 
 def _attempt(target: Target, each: Case) -> tuple[Verdict, str]:
@@ -127,14 +127,14 @@ def _restore(target: Target, snapshot: dict[Variable, bytes]) -> Iterator[str]:
     """Reset the node's communication and write back what differs from the beginning; a line for each that did."""
     _reset(target)
     after = _read_all(target)
-    for variable, before in ((known, data) for known, data in snapshot.items() if after.get(known) != data):
+    for variable, before in ((each, data) for each, data in snapshot.items() if after.get(each) != data):
         try:
             target.download(*variable.key, before)
-            done = "it was set back"
+            outcome = "it was set back"
         except CaseFailed as error:
-            done = f"it could not be set back ({error})"
-        changed = variable.show(after[variable]) if variable in after else "nothing"
-        yield f"{variable.label} held {variable.show(before)} before and {changed} after the test; {done}."
+            outcome = f"it could not be set back ({error})"
+        final_value = variable.show(after[variable]) if variable in after else "nothing"
+        yield f"{variable.label} held {variable.show(before)} before and {final_value} after the test; {outcome}."
 
 
 MOODS: dict[Verdict, Mood] = {Verdict.PASS: "good", Verdict.FAIL: "bad", Verdict.NOT_APPLICABLE: "muted",
@@ -166,8 +166,8 @@ def build_conformance_report(outcome: Outcome, target: Target, bus: str, files: 
             "bus": bus, "write": target.options.may_write,
             "counts": {verdict.value: count for verdict, count in counts.items()},
             "tests": [{"number": case.number, "name": case.name, "section": case.section, "expected": case.expected,
-                       "measured": measured, "verdict": verdict.value, "seconds": seconds, "chapter": case.chapter}
-                      for case, measured, verdict, seconds in results],
+                       "measured": text, "verdict": verdict.value, "seconds": seconds, "chapter": case.chapter}
+                      for case, text, verdict, seconds in results],
             "notes": outcome.notes,
         })
 
@@ -191,8 +191,8 @@ def _make_test_case(result: Result, node: int) -> junit.TestCase:
 
 
 def _describe(outcome: Outcome) -> str:
-    if failed := [result.case.number for result in outcome.results if result.verdict is Verdict.FAIL]:
-        return f"{count_nouns(len(failed), 'test')} failed: {', '.join(failed)}."
+    if numbers := [result.case.number for result in outcome.results if result.verdict is Verdict.FAIL]:
+        return f"{count_nouns(len(numbers), 'test')} failed: {', '.join(numbers)}."
     if outcome.is_disturbed:
         return "No test failed, but this machine was too late to measure some times; repeat it on a quiet machine."
     return f"Every applicable test passed ({_count(outcome.results)[Verdict.PASS]} of {len(outcome.results)})."

@@ -43,11 +43,11 @@ def check_expedited_upload(t: Target) -> str:
 
 def check_expedited_download(t: Target, is_size_given: bool) -> str:
     """A value is changed, with or without its number of bytes, and changed back."""
-    with changed_number(t) as (variable, before, other):
-        command = 0x23 | (4 - len(other)) << 2 if is_size_given else 0x22
-        response = t.demand(HEAD.pack(command, *variable.key) + other)
+    with changed_number(t) as (variable, before, new_data):
+        command = 0x23 | (4 - len(new_data)) << 2 if is_size_given else 0x22
+        response = t.demand(HEAD.pack(command, *variable.key) + new_data)
         require(response == HEAD.pack(0x60, *variable.key) + bytes(4), response.hex(" "))
-        t.require_value(variable, other, "does not hold what was written")
+        t.require_value(variable, new_data, "does not hold what was written")
     t.require_value(variable, before, "cannot be set back")
     return response.hex(" ")
 
@@ -80,23 +80,23 @@ def check_upload_toggle(t: Target) -> str:
     _, data = begin_upload(t)
     if len(data) > 7:
         t.demand(b"\x60")
-    said = require_abort(find_abort(t.demand, b"\x60" if len(data) > 7 else b"\x70"), (TOGGLE,))
+    abort = require_abort(find_abort(t.demand, b"\x60" if len(data) > 7 else b"\x70"), (TOGGLE,))
     require(find_abort(t.demand, b"\x70"), "the transfer goes on after the abort")
-    return said
+    return abort
 
 
 def check_segment(t: Target, change: Change, codes: Sequence[int], toggle: int = 0, is_announced: bool = False) -> str:
     """A download announces its own length, or that of the object; it is refused, and the object is unchanged."""
     what, alter = change
-    with changed_number(t) as (variable, before, other):
-        offered = alter(other)
-        code = begin_download(t, variable, len(offered) if is_announced else variable.size)
+    with changed_number(t) as (variable, before, new_data):
+        wrong_data = alter(new_data)
+        code = begin_download(t, variable, len(wrong_data) if is_announced else variable.size)
         if not (is_announced and code):
             require_abort(code, (0,), "the transfer was refused")
-            code = find_abort(t.demand, pack_segment(offered, True, toggle))
-        said = require_abort(code, codes, what)
+            code = find_abort(t.demand, pack_segment(wrong_data, True, toggle))
+        abort = require_abort(code, codes, what)
         t.require_value(variable, before, "was changed")
-    return f"{what}: {said}"
+    return f"{what}: {abort}"
 
 
 def check_refused_frame(t: Target, frame: bytes) -> str:
@@ -121,8 +121,8 @@ def check_client_abort(t: Target) -> str:
     variable, _ = begin_upload(t)
     answer = t.ask(HEAD.pack(ABORT, *variable.key) + (0x08000000).to_bytes(4, "little"), 0.1)
     require(answer is None, f"an abort was answered with {(answer or b'').hex(' ')}")
-    said = require_abort(find_abort(t.demand, b"\x60"), (COMMAND,), "the next segment")
-    return f"no answer; the next segment: {said}"
+    abort = require_abort(find_abort(t.demand, b"\x60"), (COMMAND,), "the next segment")
+    return f"no answer; the next segment: {abort}"
 
 
 def check_unfinished_transfer(t: Target) -> str:

@@ -103,28 +103,28 @@ def for_each(select: Callable[[Target], Iterable[Item]], probe: Callable[[Target
     sentence around it. Without anything that counts the case is not applicable.
     """
     def check(t: Target) -> str:
-        found: list[str] = []
+        labels: list[str] = []
         problems: list[str] = []
         reason: CaseNotApplicable | None = None
         for item in select(t):
             try:
-                found.append(probe(t, item) or "")
+                labels.append(probe(t, item) or "")
             except Problem as problem:
                 problems.append(str(problem))
             except CaseNotApplicable as end:
                 reason = reason or end
         require(not problems, join_labels(problems))
-        if not found:
+        if not labels:
             raise reason or CaseNotApplicable("the EDS has no such object")
-        return text.format(count_nouns(len(found), noun) if noun else join_labels(found, 8))
+        return text.format(count_nouns(len(labels), noun) if noun else join_labels(labels, 8))
 
     return check
 
 
-def require(condition: object, measured: str, end: type[CaseEnd] = Problem) -> None:
+def require(condition: object, text: str, end: type[CaseEnd] = Problem) -> None:
     """Ends the case, as a rule with Problem, unless the condition holds."""
     if not condition:
-        raise end(measured)
+        raise end(text)
 
 
 def require_applicable(condition: object, reason: str = "") -> None:
@@ -139,8 +139,8 @@ def join_labels(labels: Sequence[str], most: int = 4) -> str:
     ('a, b and 1 more', 'a, b; c')
     """
     mark = "; " if any("," in label for label in labels) else ", "
-    shown = mark.join(labels[:most])
-    return f"{shown} and {len(labels) - most} more" if len(labels) > most else shown
+    text = mark.join(labels[:most])
+    return f"{text} and {len(labels) - most} more" if len(labels) > most else text
 
 
 MS = 1_000_000  # ns
@@ -236,11 +236,11 @@ class Target:
         end = self.now() + round(seconds * 1e9)
         while True:
             before = self.now()
-            planned = max(min(end - before, 5 * MS), 0)
-            if self._wire.wait(done, planned * 1e-9):
+            pause = max(min(end - before, 5 * MS), 0)
+            if self._wire.wait(done, pause * 1e-9):
                 return True
             after = self.now()
-            self.stall = max(self.stall, (after - before - planned) * 1e-9)
+            self.stall = max(self.stall, (after - before - pause) * 1e-9)
             if after >= end:
                 return done()
 
@@ -377,8 +377,8 @@ class Target:
         seconds = self.options.timeout + 1.0 + 3 * (self.fixed_heartbeat or 0.0)
         frames = self.wait_for(self.heartbeat_id, seconds, lambda frame: frame.data != b"\0", 2)
         require(frames, "no heartbeat came", CaseFailed)
-        found = frames[1].data[0] & 0x7F if len(frames[1].data) == 1 else -1
-        require(found == state, f"{after}: {name_state(found)}, expected {name_state(state)}")
+        actual_state = frames[1].data[0] & 0x7F if len(frames[1].data) == 1 else -1
+        require(actual_state == state, f"{after}: {name_state(actual_state)}, expected {name_state(state)}")
 
     def enter(self, state: NmtState) -> None:
         """Command a state, and see that the node takes it on, if it says so. Raises Problem."""
@@ -407,24 +407,24 @@ class Target:
 
     def find_free_identifier(self) -> int:
         """An identifier that a PDO may use and nobody does, as far as was heard. Raises Refusal, Problem."""
-        used = {*(frame.cob_id for frame in self.frames),
-                *(self.read(pdo.parameter, 1) & 0x7FF for pdo in self.sheet.pdos)}
-        return next(each for each in range(0x57E, 0x480, -1) if each not in used)
+        used_ids = {*(frame.cob_id for frame in self.frames),
+                    *(self.read(pdo.parameter, 1) & 0x7FF for pdo in self.sheet.pdos)}
+        return next(each for each in range(0x57E, 0x480, -1) if each not in used_ids)
 
 
-def find_abort(action: Callable[Request, object], *request: Request.args, **named: Request.kwargs) -> int:
+def find_abort(action: Callable[Request, object], *request: Request.args, **keywords: Request.kwargs) -> int:
     """The abort code with which the node refuses a request, 0 if it does not. Raises CaseFailed without a response."""
     try:
-        action(*request, **named)
+        action(*request, **keywords)
     except Refusal as refusal:
         return refusal.code
     return 0
 
 
-def require_abort(code: int, accepted: Sequence[int], what: str = "") -> str:
-    """The abort code in words. Raises Problem unless it is one of the accepted ones."""
+def require_abort(code: int, codes: Sequence[int], what: str = "") -> str:
+    """The abort code in words. Raises Problem unless it is one of `codes`."""
     text = format_abort(code)
-    require(code in accepted, f"{what}: {text}" if what else text)
+    require(code in codes, f"{what}: {text}" if what else text)
     return text
 
 
