@@ -83,12 +83,12 @@ def measure_drive_error(trace: Trace, model: Model) -> float | None:
     x = filtfilt(*butter(4, CUT_OFF), trace.controlled)
     v = np.gradient(x, trace.period)
     motion = np.column_stack([x, v, np.gradient(v, trace.period)])
-    needed = compute_needed_drive(model, motion, trace.load)[TRANSIENT:-TRANSIENT]
-    acting = np.concatenate([trace.drive[:1], trace.drive[:-1]])[TRANSIENT:-TRANSIENT]
-    kept = np.convolve(~trace.usable[TRANSIENT:-TRANSIENT], np.ones(DECIMATION), "same")[::DECIMATION] < 0.5
-    u, left = (decimate(column, DECIMATION, zero_phase=True)[kept] for column in (acting, acting - needed))
+    needed_drive = compute_needed_drive(model, motion, trace.load)[TRANSIENT:-TRANSIENT]
+    drive = np.concatenate([trace.drive[:1], trace.drive[:-1]])[TRANSIENT:-TRANSIENT]
+    is_kept = np.convolve(~trace.usable[TRANSIENT:-TRANSIENT], np.ones(DECIMATION), "same")[::DECIMATION] < 0.5
+    u, residual = (decimate(column, DECIMATION, zero_phase=True)[is_kept] for column in (drive, drive - needed_drive))
     size = float(np.linalg.norm(u))
-    return float(np.linalg.norm(left)) / size if size else None
+    return float(np.linalg.norm(residual)) / size if size else None
 
 
 LAGS = range(-8, 21)  # cycles that command or controlled signal may be late in the file
@@ -115,15 +115,15 @@ def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
     limit = model.values.get(model.kind.signals.drive.limit, math.inf)
     if not model.kind.controller:
         return ControllerBlock(math.nan, math.nan, limit=limit)
-    found = _compare_at_lags(trace, model, limit, 0, 0)
-    if not found.ratio > CONTROLLER_ERROR_RATIO:  # or it cannot be told
-        return found
+    answer = _compare_at_lags(trace, model, limit, 0, 0)
+    if not answer.ratio > CONTROLLER_ERROR_RATIO:  # or it cannot be told
+        return answer
     com, xj, gain = find_lags(trace, limit)
-    found = found._replace(gain=gain)
+    answer = answer._replace(gain=gain)
     if (com, xj) == (0, 0):
-        return found
-    late = _compare_at_lags(trace, model, limit, com, xj)
-    return late._replace(gain=gain) if late.error < CONTROLLER_LAG_RATIO * found.error else found
+        return answer
+    late_answer = _compare_at_lags(trace, model, limit, com, xj)
+    return late_answer._replace(gain=gain) if late_answer.error < CONTROLLER_LAG_RATIO * answer.error else answer
 
 
 def _compare_at_lags(trace: Trace, model: Model, limit: float, com: int, xj: int) -> ControllerBlock:
@@ -237,53 +237,53 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     progress("reading", 0.0)
     trace = prepare_trace(trace, model, signals, source)
     model = match_period(model, trace)
-    trace, found = _align_delays(trace, model, compare_controller(trace, model))
+    trace, answer = _align_delays(trace, model, compare_controller(trace, model))
     trace = leave_out_rest(trace, model)
-    others = [find_repeat(trace, other, model, number) for number, other in enumerate(repeats, 1)]
+    repeats = [find_repeat(trace, other, model, number) for number, other in enumerate(repeats, 1)]
     progress("solver", 1 / STAGES)
     noise = sensor_floors(trace, model)
     replay = replay_with_checked_steps(trace, model, {name: f.value for name, f in noise.items()})
     progress("repeats", 2 / STAGES)
-    runs = [(other, replay_current(other, model, replay.steps)) for other in others]
-    theirs = [compute_residuals(other, run) for other, run in runs]
+    runs = [(other, replay_current(other, model, replay.steps)) for other in repeats]
+    repeat_residuals = [compute_residuals(other, run) for other, run in runs]
     # without repeats, the floor holds what a current that was not recorded leaves open
     widened = {name: f._replace(value=math.hypot(f.value, replay.blind[name])) for name, f in noise.items()}
-    floor = widened | find_floors(replay.residual, theirs, trace.period)
-    off_alone = find_rows_off_alone(replay.residual, theirs, floor)
+    floor = widened | find_floors(replay.residual, repeat_residuals, trace.period)
+    off_alone = find_rows_off_alone(replay.residual, repeat_residuals, floor)
     replay = replay._replace(undecided=replay.undecided | off_alone)
     if off_alone.any():
-        floor |= find_floors({name: np.where(off_alone, np.nan, r) for name, r in replay.residual.items()}, theirs,
-                             trace.period)
-    sensed = trace.declared.controlled.name
-    if sensed in floor and any(model.find_effect(name).port == "reading" for name in model.effects):
+        floor |= find_floors({name: np.where(off_alone, np.nan, r) for name, r in replay.residual.items()},
+                             repeat_residuals, trace.period)
+    controlled = trace.declared.controlled.name
+    if controlled in floor and any(model.find_effect(name).port == "reading" for name in model.effects):
         # repeats are rounded alike
-        floor[sensed] = floor[sensed]._replace(value=max(floor[sensed].value, noise[sensed].value))
+        floor[controlled] = floor[controlled]._replace(value=max(floor[controlled].value, noise[controlled].value))
     left_out = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
-    judged = {name: np.where(left_out, np.nan, r) for name, r in replay.residual.items()}
+    residual = {name: np.where(left_out, np.nan, r) for name, r in replay.residual.items()}
     progress("closed loop", 3 / STAGES)
-    closed, (free, speed) = replay_command(trace, model), measure_drift(trace, model)
-    table = {name: _measure_signal(trace.declared.find(name), r, floor[name], noise[name], closed[name], replay)
-             for name, r in judged.items()}
+    loop_residual, (free_error, drift) = replay_command(trace, model), measure_drift(trace, model)
+    table = {name: _measure_signal(trace.declared.find(name), r, floor[name], noise[name], loop_residual[name], replay)
+             for name, r in residual.items()}
     doubtful = describe_doubtful_repeats(floor, noise, trace.declared)
     progress("blocks", 4 / STAGES)
-    ratios, parts = _judge_blocks(trace, model, replay.model, runs, table, found, noise)
+    ratios, parts = _judge_blocks(trace, model, replay.model, runs, table, answer, noise)
     progress("where", 5 / STAGES)
     m = describe_motion(trace, replay.model)
-    z2 = combine_residuals(judged, {name: f.value for name, f in floor.items()})
-    sections, when = locate_error(trace, z2, m, found.limit), find_condition(z2, m, found.limit)
+    z2 = combine_residuals(residual, {name: f.value for name, f in floor.items()})
+    sections, condition = locate_error(trace, z2, m, answer.limit), find_condition(z2, m, answer.limit)
     verdict, reason = _decide_verdict(table, sections, ratios, replay, trace.period, doubtful)
-    diagnoses = examine_residuals(trace, judged, {name: (replay.residual[name] - r) / math.sqrt(2.0)
-                                     for name, r in (theirs[0] if theirs else {}).items()}, m)
+    diagnoses = examine_residuals(trace, residual, {name: (replay.residual[name] - r) / math.sqrt(2.0)
+                                     for name, r in (repeat_residuals[0] if repeat_residuals else {}).items()}, m)
     progress("tolerances", 6 / STAGES)
     is_plant_wrong = verdict == "MODEL_INCOMPLETE" and any(s.ratio > s.limit for s in table.values())
     floors = {name: s.floor.value for name, s in table.items()}
-    scattered = fit_scatter(trace, model, floors) if is_plant_wrong and list_tolerance_sizes(model) else None
+    scatter = fit_scatter(trace, model, floors) if is_plant_wrong and list_tolerance_sizes(model) else None
     progress("done", 1.0)
-    named = _list_blocks_above(ratios, table)
-    return Comparison(source, model, trace, verdict, reason, table, found, ratios, parts, named, tuple(sections),
-                      when, free, speed, measure_drive_error(trace, model), scattered, diagnoses, replay,
-                      len(others), (*trace.notes, *([doubtful] if doubtful and verdict != "CANNOT_TELL" else []),
-                                    *_list_notes(floor, replay, trace, off_alone)))
+    return Comparison(source, model, trace, verdict, reason, table, answer, ratios, parts,
+                      _list_blocks_above(ratios, table), tuple(sections), condition, free_error, drift,
+                      measure_drive_error(trace, model), scatter, diagnoses, replay, len(repeats),
+                      (*trace.notes, *([doubtful] if doubtful and verdict != "CANNOT_TELL" else []),
+                       *_list_notes(floor, replay, trace, off_alone)))
 
 
 def find_rows_off_alone(residual: Columns, repeats: Sequence[Columns], floor: Mapping[str, Floor]) -> Flags:
@@ -303,31 +303,31 @@ def find_rows_off_alone(residual: Columns, repeats: Sequence[Columns], floor: Ma
         usual = np.median(share, axis=1, keepdims=True)  # a signal may be sampled in few rows
         return np.where(share > 0.5 * usual, power, np.inf)
 
-    own = np.nan_to_num(np.array([values / floor[name].value for name, values in residual.items()]))
+    scaled_residual = np.nan_to_num(np.array([values / floor[name].value for name, values in residual.items()]))
     best = np.min([measure_known_power(other).max(axis=0) for other in repeats], axis=0)
-    is_off = extend_until_noise(measure_window_power(own).max(axis=0) > RUN_IS_OFF, own)
+    is_off = extend_until_noise(measure_window_power(scaled_residual).max(axis=0) > RUN_IS_OFF, scaled_residual)
     is_off[:rows] &= best <= RUN_FITS
     is_off[rows:] = False
     return is_off
 
 
-def _measure_signal(signal: Signal, residual: Floats, floor: Floor, noise: Floor, closed: Floats,
+def _measure_signal(signal: Signal, residual: Floats, floor: Floor, noise: Floor, loop_residual: Floats,
                     replay: Replay) -> SignalError:
     samples = int((~np.isnan(residual)).sum())
     ratio_spread = 1.0 / math.sqrt(max(1.0, samples * floor.freedom))  # of two RMS values of so many samples each
-    return SignalError(signal, rms(residual), floor, noise.value, rms(closed), replay.solver_error[signal.name],
+    return SignalError(signal, rms(residual), floor, noise.value, rms(loop_residual), replay.solver_error[signal.name],
                        SIGNAL_ERROR_RATIO + 3 * ratio_spread)
 
 
-def _align_delays(trace: Trace, model: Model, found: ControllerBlock) -> tuple[Trace, ControllerBlock]:
+def _align_delays(trace: Trace, model: Model, answer: ControllerBlock) -> tuple[Trace, ControllerBlock]:
     """Columns that are cycles late in the file, set right; a firmware that answers late stays as it is."""
-    com, xj = found.com_lag, found.xj_lag
+    com, xj = answer.com_lag, answer.xj_lag
     drive, sensed = trace.declared.drive.symbol, trace.declared.controlled.symbol
     notes = []
     if xj:
-        moved = trace.with_inputs(drive=shift_rows(trace.drive, -xj))
-        if measure_misfit(moved, model) < measure_misfit(trace, model) + math.log(LAG_MISFIT_RATIO):
-            trace, com = moved, com - xj
+        aligned_trace = trace.with_inputs(drive=shift_rows(trace.drive, -xj))
+        if measure_misfit(aligned_trace, model) < measure_misfit(trace, model) + math.log(LAG_MISFIT_RATIO):
+            trace, com = aligned_trace, com - xj
             notes.append(f"{drive} stands {_describe_cycles(xj)} than the other columns: moved into step")
         else:
             notes.append(f"{drive} fits the {sensed} {_describe_cycles(-xj)}: the firmware answers late, "
@@ -336,7 +336,7 @@ def _align_delays(trace: Trace, model: Model, found: ControllerBlock) -> tuple[T
         trace = trace.with_inputs(command=shift_rows(trace.command, com))
         command = trace.declared.command.symbol
         notes.append(f"{command} stands {_describe_cycles(-com)} than the rest of the trace: moved into step")
-    return trace.with_notes(*notes), found
+    return trace.with_notes(*notes), answer
 
 
 def _describe_cycles(n: int) -> str:
@@ -344,18 +344,18 @@ def _describe_cycles(n: int) -> str:
 
 
 def _judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple[Trace, Columns]],
-                  table: Mapping[str, SignalError], found: ControllerBlock,
+                  table: Mapping[str, SignalError], answer: ControllerBlock,
                   noise: Mapping[str, Floor]) -> tuple[dict[str, float | None], dict[str, float | None]]:
     """Ratios of the blocks, None where nothing measured can tell, and the parts of those that have some.
 
     A plant that declares no balances is one block, as wrong as its worst signal; its sensors cannot be told from it.
     """
     signal = {name: s.ratio for name, s in table.items()}
-    ratios = {"controller": found.ratio if math.isfinite(found.error) else None}
+    ratios = {"controller": answer.ratio if math.isfinite(answer.error) else None}
     if not model.kind.balances:
         return ratios | {"plant": max(signal.values()), "sensors": None}, dict.fromkeys(("flow", "force", "gain"))
-    own, parts = judge_blocks(trace, model, run, repeats, signal, noise)
-    return ratios | own, parts
+    block_ratios, parts = judge_blocks(trace, model, run, repeats, signal, noise)
+    return ratios | block_ratios, parts
 
 
 def _list_blocks_above(ratios: Mapping[str, float | None], table: Mapping[str, SignalError]) -> tuple[str, ...]:
@@ -387,9 +387,9 @@ def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place],
         doubt = "without a repeat the floor is only a lower bound, and the error is not far above it"
     elif edgy > UNDECIDED_SHARE:
         doubt = f"{100 * edgy:.0f} % of the trace {_describe_cause(replay)}"
-    sure = any(s.ratio > LOWER_BOUND_ERROR_RATIO or not (edgy > UNDECIDED_SHARE or s.floor.lower_bound)
-               for s in above)
-    is_open = doubt and not sure and (ratios["controller"] or 0.0) <= CONTROLLER_ERROR_RATIO
+    is_sure = any(s.ratio > LOWER_BOUND_ERROR_RATIO or not (edgy > UNDECIDED_SHARE or s.floor.lower_bound)
+                  for s in above)
+    is_open = doubt and not is_sure and (ratios["controller"] or 0.0) <= CONTROLLER_ERROR_RATIO
     return ("CANNOT_TELL", doubt) if is_open else ("MODEL_INCOMPLETE", "")
 
 

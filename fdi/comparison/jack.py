@@ -44,31 +44,31 @@ class Balance(NamedTuple):
     position: Floats  # m, as the flow adds it up
 
 
-def compute_balance(trace: Trace, model: Model, replayed: Columns) -> Balance:
+def compute_balance(trace: Trace, model: Model, run: Columns) -> Balance:
     """Flow and force of the jack from measured XS and P12; an XS that was not measured is the replay's."""
-    chosen = [trace.column(name) if name in trace.outputs else replayed[name] for name in (P12, XS)]
-    (p12, lost), (xs, missing) = (bridge_gaps(column, BRIDGED_ROWS) for column in chosen)
+    columns = [trace.column(name) if name in trace.outputs else run[name] for name in (P12, XS)]
+    (p12, is_p12_missing), (xs, is_xs_missing) = (bridge_gaps(column, BRIDGED_ROWS) for column in columns)
     xj = bridge_gaps(trace.controlled, BRIDGED_ROWS)[0]
-    seen = differentiate(xj, max(5, round(MEAN / trace.period) | 1), 1) / trace.period
-    bad = lost | missing | ~trace.usable
+    sensed_speed = differentiate(xj, max(5, round(MEAN / trace.period) | 1), 1) / trace.period
+    is_bad = is_p12_missing | is_xs_missing | ~trace.usable
     if P12 not in trace.outputs:  # not the replay's, which hangs on the valve, but what motion takes where it is sure
-        error = _compute_force_residual(trace, model, p12, xj, seen)
-        p12, bad = p12 - np.nan_to_num(error), bad | np.isnan(error)
+        error = _compute_force_residual(trace, model, p12, xj, sensed_speed)
+        p12, is_bad = p12 - np.nan_to_num(error), is_bad | np.isnan(error)
     saturated_share = 0.98  # of the supply pressure: the edges' law says nothing about the speed there
-    bad |= np.abs(p12) > saturated_share * model["supply.pressure"]
+    is_bad |= np.abs(p12) > saturated_share * model["supply.pressure"]
     sensed, speed = compute_flow_balance(model, xs, p12, float(xj[0]))
     lag = count_span_rows(trace.period)
     way = difference_over(trace.controlled - sensed, lag)
-    way[extend_flags(bad, lag)] = np.nan
+    way[extend_flags(is_bad, lag)] = np.nan
     dx = difference_over(xj, lag)
-    there = ~np.isnan(way) & ~np.isnan(dx)
-    power = float(np.sum(dx[there] ** 2))
-    gain = float(np.sum(dx[there] * way[there])) / power if power > 0.0 else 0.0
+    has_value = ~np.isnan(way) & ~np.isnan(dx)
+    power = float(np.sum(dx[has_value] ** 2))
+    gain = float(np.sum(dx[has_value] * way[has_value])) / power if power > 0.0 else 0.0
     # without a measured spool the flow is the servovalve's, and the forces take their speed from the position
-    known = speed * (1 + max(-0.2, min(gain, 0.2))) if XS in trace.outputs else seen
+    ram_speed = speed * (1 + max(-0.2, min(gain, 0.2))) if XS in trace.outputs else sensed_speed
     is_known = P12 in trace.outputs
-    force = _compute_force_residual(trace, model, p12, xj, known) if is_known else np.full(len(trace), np.nan)
-    force[bad] = np.nan
+    force = _compute_force_residual(trace, model, p12, xj, ram_speed) if is_known else np.full(len(trace), np.nan)
+    force[is_bad] = np.nan
     return Balance(way, force, gain, speed, sensed)
 
 
@@ -91,9 +91,9 @@ def _compute_force_residual(trace: Trace, model: Model, p12: Floats, xj: Floats,
     mean = np.convolve(speed, kernel, "same")
     bend = mean[2 * size:] - 2.0 * mean[size:-size] + mean[:-2 * size]  # of means that share no sample
     noise = float(np.median(np.abs(bend))) / 0.6745 / math.sqrt(6.0)
-    seen = np.convolve(np.gradient(xj, trace.period), kernel, "same")
+    sensed_speed = np.convolve(np.gradient(xj, trace.period), kernel, "same")
     direction = np.where(mean > SURE * noise, 1.0, np.where(mean < -SURE * noise, -1.0, 0.0))
-    direction[(np.abs(seen) > LOOSE) & (np.sign(seen) != direction)] = 0.0
+    direction[(np.abs(sensed_speed) > LOOSE) & (np.sign(sensed_speed) != direction)] = 0.0
     turned = extend_flags(np.diff(direction, prepend=direction[0]) != 0.0, size)
     turned |= np.roll(turned, -size) | ~_find_resolved(speed, trace.period)
     pushed = np.abs(np.diff(trace.load, prepend=trace.load[0])) > PUSH * model["jack.area"]
@@ -123,10 +123,10 @@ def share_error(trace: Trace, b: Balance, xs: Floats, p12: Floats, floor: float,
     lag, x = count_span_rows(trace.period), b.position
     rates = [np.concatenate([[0.0], np.cumsum(r)[:-1]]) * trace.period for r in _list_rate_shapes(xs, p12)]
     places = [x, b.speed, p12, *(apply_play(x, width) for width in PLAYS)]
-    there = ~np.isnan(b.way)
-    columns = [difference_over(s, lag)[there] for s in (*rates, *places)]
-    error, (rate, place, gain, both) = _measure_remainders(b.way[there], columns, len(rates))
-    effective = int(there.sum()) / lag
+    has_value = ~np.isnan(b.way)
+    columns = [difference_over(s, lag)[has_value] for s in (*rates, *places)]
+    error, (rate, place, gain, both) = _measure_remainders(b.way[has_value], columns, len(rates))
+    effective = int(has_value.sum()) / lag
 
     def measure_evidence(one: float, other: float) -> float:
         """Twice the log likelihood by which `one` describes worse than `other`."""
@@ -166,17 +166,17 @@ def _measure_remainders(y: Floats, columns: list[Floats], first: int
 def _list_rate_shapes(xs: Floats, p12: Floats) -> list[Floats]:
     """Errors of speed that a valve or a jack can make, as functions of opening and pressure, each of order one."""
     x, p = xs / 1e-4, p12 / 1e6
-    edge, narrow, held = np.tanh(xs / 2e-5), np.tanh(xs / 5e-6), np.tanh(p / 0.3)
+    edge, narrow, pressure_sign = np.tanh(xs / 2e-5), np.tanh(xs / 5e-6), np.tanh(p / 0.3)
     return [np.ones(len(x)), x, np.abs(x), p, np.abs(p), x * p, x * np.abs(x), np.abs(x) * p, x * x * p,
-            x * np.abs(p), x * p * p, edge, narrow, held, edge * np.abs(p)]
+            x * np.abs(p), x * p * p, edge, narrow, pressure_sign, edge * np.abs(p)]
 
 
 def apply_play(x: Floats, width: float) -> Floats:
     """x behind a play of that width, m: the elementary hysteresis."""
-    out, held, half = [], float(x[0]), 0.5 * width
+    out, follower, half = [], float(x[0]), 0.5 * width
     for value in x.tolist():
-        held = min(max(held, value - half), value + half)
-        out.append(held)
+        follower = min(max(follower, value - half), value + half)
+        out.append(follower)
     return np.array(out)
 
 
@@ -192,15 +192,15 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     """
     b = compute_balance(trace, model, run)
     free = replay_current(trace, model, anchor=0.0)  # the measured position would pull it off its own balance
-    mine = trace.with_columns({name: free[name] for name in trace.outputs})
-    own = compute_balance(add_noise(mine, level), model, free)
-    others = [compute_balance(other, model, theirs) for other, theirs in repeats]
-    floor = {"way": rms(own.way), "force": rms(own.force)}
-    for name, f in find_floors({"way": b.way, "force": b.force}, [{"way": o.way, "force": o.force} for o in others],
-                               trace.period).items():
+    model_trace = trace.with_columns({name: free[name] for name in trace.outputs})
+    model_balance = compute_balance(add_noise(model_trace, level), model, free)
+    repeat_balances = [compute_balance(other, model, theirs) for other, theirs in repeats]
+    floor = {"way": rms(model_balance.way), "force": rms(model_balance.force)}
+    for name, f in find_floors({"way": b.way, "force": b.force},
+                               [{"way": o.way, "force": o.force} for o in repeat_balances], trace.period).items():
         floor[name] = float(np.fmax(floor[name], f.value))
-    known = [trace.column(name) if name in trace.outputs else run[name] for name in (XS, P12)]
-    xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in known)
+    columns = [trace.column(name) if name in trace.outputs else run[name] for name in (XS, P12)]
+    xs, p12 = (bridge_gaps(column, BRIDGED_ROWS)[0] for column in columns)
     if (~np.isnan(b.way)).sum() < FEWEST_FORCE_ROWS or not floor["way"] > 0.0:
         return {}
     is_noisy = (XJ in level
@@ -209,8 +209,8 @@ def judge_jack(trace: Trace, model: Model, run: Columns, repeats: Sequence[tuple
     flow = flow if XS in trace.outputs else max(flow, sensor)
     most_missing = 0.2  # of the rows; where more are missing, accelerations are guesses
     is_enough = (~np.isnan(b.force)).sum() >= FEWEST_FORCE_ROWS and trace.filled.mean() < most_missing
-    is_told = is_enough and floor["force"] > 0.0
-    return {"flow": flow, "force": rms(b.force) / floor["force"] if is_told else None, "sensor": sensor,
+    is_judged = is_enough and floor["force"] > 0.0
+    return {"flow": flow, "force": rms(b.force) / floor["force"] if is_judged else None, "sensor": sensor,
             "gain": b.gain}
 
 
@@ -234,12 +234,12 @@ def judge_blocks(trace: Trace, model: Model, run: Columns, repeats: Sequence[tup
     level = {XJ: simulate_reading_noise(model, trace.controlled)} | {name: f.value for name, f in noise.items()}
     # the balances of flow and force take the measured signals as the true ones
     is_balanced = bool({P12, XS} & set(trace.outputs)) and not trace.filtered
-    own = judge_jack(trace, model, run, repeats, level) if is_balanced else {}
-    parts = {name: own.get(name) for name in ("flow", "force", "gain")}
+    jack = judge_jack(trace, model, run, repeats, level) if is_balanced else {}
+    parts = {name: jack.get(name) for name in ("flow", "force", "gain")}
     ratios = {"servovalve": parts["flow"], "jack": parts["force"], "sensor": None}
     if XS in trace.outputs:
-        known = [x for x in (parts["flow"], parts["force"]) if x is not None]
-        if known and P12 in signal and signal[XS] < SPOOL_FITS_RATIO:
-            known.append(signal[P12])
-        ratios |= {"servovalve": signal[XS], "jack": max(known, default=None), "sensor": own.get("sensor")}
+        jack_ratios = [x for x in (parts["flow"], parts["force"]) if x is not None]
+        if jack_ratios and P12 in signal and signal[XS] < SPOOL_FITS_RATIO:
+            jack_ratios.append(signal[P12])
+        ratios |= {"servovalve": signal[XS], "jack": max(jack_ratios, default=None), "sensor": jack.get("sensor")}
     return ratios, parts

@@ -80,8 +80,8 @@ def describe_motion(trace: Trace, model: Columns) -> Motion:
 def combine_residuals(residual: Columns, floor: Mapping[str, float]) -> Floats:
     """Squared error over squared floor, mean of the signals, (n,); 1 on average where only noise is left."""
     stack = np.array([(residual[name] / floor[name]) ** 2 for name in residual if floor.get(name, 0.0) > 0.0])
-    there = ~np.isnan(stack)
-    return np.where(there.any(axis=0), np.nansum(stack, axis=0) / np.maximum(there.sum(axis=0), 1), np.nan)
+    has_value = ~np.isnan(stack)
+    return np.where(has_value.any(axis=0), np.nansum(stack, axis=0) / np.maximum(has_value.sum(axis=0), 1), np.nan)
 
 
 def locate_error(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Place]:
@@ -94,32 +94,32 @@ def locate_error(trace: Trace, z2: Floats, m: Motion, limit: float) -> list[Plac
         inside = z2[rows]
         if total <= 0.0 or (~np.isnan(inside)).sum() * trace.period < shortest:
             continue
-        chosen = np.zeros(len(z2), bool)
-        chosen[rows] = True
+        is_in_section = np.zeros(len(z2), bool)
+        is_in_section[rows] = True
         share = float(np.nansum(inside)) / total
-        said = find_condition(np.where(chosen, z2, np.nan), m, limit) if share > 0.03 else ""
+        condition = find_condition(np.where(is_in_section, z2, np.nan), m, limit) if share > 0.03 else ""
         words = describe_section(section, float(np.abs(trace.command[rows]).max()), trace.declared.command.unit)
         t0, t1 = float(trace.t[section.start]), float(trace.t[section.stop - 1] + trace.period)
-        out.append(Place(words, t0, t1, share, math.sqrt(float(np.nanmean(inside))), said))
+        out.append(Place(words, t0, t1, share, math.sqrt(float(np.nanmean(inside))), condition))
     return sorted(out, key=lambda place: -place.share)
 
 
 def find_condition(z2: Floats, m: Motion, limit: float) -> str:
     """The condition under which the excess of `z2` (n,) over 1 is gathered, in words; "" if under none."""
-    there = ~np.isnan(z2)
-    excess = np.where(there, z2 - 1.0, 0.0)
-    total, rows = float(excess.sum()), int(there.sum())
+    has_value = ~np.isnan(z2)
+    excess = np.where(has_value, z2 - 1.0, 0.0)
+    total, rows = float(excess.sum()), int(has_value.sum())
     if rows == 0 or total < CONDITION_EXCESS_LEAST * rows:
         return ""
-    best, said = 0.0, ""
+    best, condition = 0.0, ""
     for words, flags in _list_conditions(m, limit):
-        time = float((flags & there).sum()) / rows
+        time = float((flags & has_value).sum()) / rows
         part = float(excess[flags].sum()) / total
         # the gain over spreading it evenly; a condition that holds nearly always or hardly ever gains little
         score = part - time
         if part >= CONDITION_SHARE and time > 0.0 and part / time >= CONDITION_DENSITY and score > best + 0.01:
-            best, said = score, f"{100 * min(part, 1.0):.0f} % of it in {100 * time:.2g} % of the time: {words}"
-    return said
+            best, condition = score, f"{100 * min(part, 1.0):.0f} % of it in {100 * time:.2g} % of the time: {words}"
+    return condition
 
 
 def _list_conditions(m: Motion, limit: float) -> Sequence[tuple[str, Flags]]:
@@ -240,20 +240,20 @@ def _examine_signal(trace: Trace, residual: Floats, difference: Floats | None,
                     inputs: Mapping[str, tuple[Floats, Floats]], quantities: Mapping[str, Floats]) -> ResidualTests:
     r = np.nan_to_num(residual)
     e = apply_whitener(r, fit_whitener(difference) if difference is not None else WHITE)
-    own = autocorrelate(e)
+    correlation = autocorrelate(e)
     band = float(ndtri(0.5 + RESIDUAL_TEST_CONFIDENCE / 2)) / math.sqrt(len(e))
-    frequencies, power, departs, allowed = cumulate_periodogram(e, trace.period)
+    frequencies, power, departs, bartlett_band = cumulate_periodogram(e, trace.period)
     _, plain, _, _ = cumulate_periodogram(r, trace.period)
-    half = float(frequencies[min(int(np.searchsorted(plain, 0.5)), len(frequencies) - 1)])
+    half_power = float(frequencies[min(int(np.searchsorted(plain, 0.5)), len(frequencies) - 1)])
     quiet = autocorrelate(np.nan_to_num(difference)) if difference is not None else np.eye(1, REACH + 1)[0]
     follows = tuple(correlate_with_input(name, u, by, r, trace.period) for name, (u, by) in inputs.items())
-    found = [bin_residual(name, q, residual) for name, q in quantities.items()]
-    depends = sorted((d for d in found if d is not None), key=lambda d: -d.share)
+    candidates = [bin_residual(name, q, residual) for name, q in quantities.items()]
+    depends = sorted((d for d in candidates if d is not None), key=lambda d: -d.share)
     # the lags at which they first are below 1/e
     memory, noise_memory = (int(np.argmax(np.append(x, 0.0) < 1 / math.e)) * trace.period
                             for x in (autocorrelate(r), quiet))
-    return ResidualTests(memory, noise_memory, own, band, frequencies, power, departs, allowed, half, follows,
-                         tuple(depends))
+    return ResidualTests(memory, noise_memory, correlation, band, frequencies, power, departs, bartlett_band,
+                         half_power, follows, tuple(depends))
 
 
 def autocorrelate(x: Floats) -> Floats:
@@ -293,30 +293,30 @@ def cumulate_periodogram(x: Floats, period: float) -> tuple[Floats, Floats, floa
     frequencies = np.arange(1, len(x) // 2) / (len(x) * period)
     power: Floats = np.abs(np.fft.rfft(x)[1:len(x) // 2]) ** 2
     total = power.sum()
-    added = np.cumsum(power) / total if total > 0.0 else np.linspace(0, 1, len(power))
-    line = np.arange(1, len(added) + 1) / len(added)
-    return frequencies, added, float(np.abs(added - line).max()), float(kolmogi(0.05)) / math.sqrt(len(added))
+    curve = np.cumsum(power) / total if total > 0.0 else np.linspace(0, 1, len(power))
+    line = np.arange(1, len(curve) + 1) / len(curve)
+    return frequencies, curve, float(np.abs(curve - line).max()), float(kolmogi(0.05)) / math.sqrt(len(curve))
 
 
 def correlate_with_input(name: str, u: Floats, by: Floats, residual: Floats, period: float) -> Follows:
     """Cross-correlation with an input (n,); both are filtered `by` the colour of its steps to make them white."""
-    steps, left = (apply_whitener(np.diff(x), by) for x in (u, residual))
+    steps, residual_steps = (apply_whitener(np.diff(x), by) for x in (u, residual))
     # a jump of the command would stand for the whole test
-    steps, left = (np.clip(x, -WILD * x.std(), WILD * x.std()) for x in (steps, left))
-    size = math.sqrt(float(np.sum(left**2)) * float(np.sum(steps**2))) or 1.0
-    curve: Floats = correlate(left, steps, -BEFORE, AFTER) / size
+    steps, residual_steps = (np.clip(x, -WILD * x.std(), WILD * x.std()) for x in (steps, residual_steps))
+    size = math.sqrt(float(np.sum(residual_steps**2)) * float(np.sum(steps**2))) or 1.0
+    curve: Floats = correlate(residual_steps, steps, -BEFORE, AFTER) / size
     lags: Floats = np.linspace(-BEFORE * period, AFTER * period, AFTER + BEFORE + 1)
     peak = BEFORE + 1 + int(np.abs(curve[BEFORE + 1:]).argmax())  # what comes before its cause is feedback
     # Bartlett: what is left of both colours widens the band. Of all lags the largest is taken: they share the 1 %
-    wider = 1.0 + 2.0 * float(np.sum(autocorrelate(left)[1:] * autocorrelate(steps)[1:]))
+    wider = 1.0 + 2.0 * float(np.sum(autocorrelate(residual_steps)[1:] * autocorrelate(steps)[1:]))
     bound = float(ndtri(1 - (1 - RESIDUAL_TEST_CONFIDENCE) / 2 / AFTER)) * math.sqrt(max(wider, 1.0) / len(steps))
     return Follows(name, float(curve[peak]), float(lags[peak]), bound, lags, curve)
 
 
 def bin_residual(name: str, quantity: Floats, residual: Floats) -> Depends | None:
     """Means of the residual (n,) over BINS of the quantity (n,) with as many samples in each; None for too few."""
-    there = ~np.isnan(quantity) & ~np.isnan(residual)
-    q, r = quantity[there], residual[there]
+    has_value = ~np.isnan(quantity) & ~np.isnan(residual)
+    q, r = quantity[has_value], residual[has_value]
     edges = np.unique(np.quantile(q, np.linspace(0, 1, BINS + 1))) if len(q) else np.empty(0)
     power = float(np.mean(r**2)) if len(r) else 0.0
     if len(edges) < 5 or power == 0.0:
@@ -326,9 +326,9 @@ def bin_residual(name: str, quantity: Floats, residual: Floats) -> Depends | Non
     means = np.bincount(where, r, len(edges) - 1) / count
     centres = np.bincount(where, q, len(edges) - 1) / count
     spread = np.sqrt(np.maximum(np.bincount(where, r**2, len(edges) - 1) / count - means**2, 0.0))
-    own = autocorrelate(r - means[where])
-    first = int(np.argmax(own < 0.05)) or len(own)
-    thin = 1.0 + 2.0 * float(own[1:first].sum())  # neighbours say the same: as many samples count as one
+    correlation = autocorrelate(r - means[where])
+    first = int(np.argmax(correlation < 0.05)) or len(correlation)
+    thin = 1.0 + 2.0 * float(correlation[1:first].sum())  # neighbours say the same: as many samples count as one
     half = float(ndtri(0.975)) * spread * np.sqrt(thin / count)
     chance = float(np.sum(spread**2 * thin) / len(r))  # what the means would hold by chance
     share = max(0.0, float(np.average(means**2, weights=count)) - chance) / power
@@ -344,10 +344,10 @@ def name_shape(x: Floats, means: Floats, count: Floats) -> str:
     best = (0.8, "")
     for word, f in zip(SHAPES, (x / scale, np.tanh(20 * x / scale), np.abs(x) / scale), strict=True):
         columns = np.column_stack([f, np.ones(len(x))] if word == SHAPES[2] else [f]) * weights[:, None]
-        left = means * weights - columns @ np.linalg.lstsq(columns, means * weights, rcond=None)[0]
-        held = 1.0 - float(left @ left) / total if total > 0.0 else 0.0
-        if held > best[0] + 0.02:
-            best = (held, word)
+        residual = means * weights - columns @ np.linalg.lstsq(columns, means * weights, rcond=None)[0]
+        share = 1.0 - float(residual @ residual) / total if total > 0.0 else 0.0
+        if share > best[0] + 0.02:
+            best = (share, word)
     return best[1]
 
 
@@ -386,15 +386,15 @@ def map_deviation(trace: Trace, residual: Mapping[str, Floats], floor: Mapping[s
     amplitude = 0.5 * (maximum_filter1d(position, width) - minimum_filter1d(position, width))
     cells = (np.digitize(amplitude, amplitudes) - 1) * (len(CELL_SPEEDS) - 1) + np.digitize(speed, speeds) - 1
     shape, size = (len(AMPLITUDES) - 1, len(CELL_SPEEDS) - 1), (len(AMPLITUDES) - 1) * (len(CELL_SPEEDS) - 1)
-    judged = ~np.all([np.isnan(r) for r in residual.values()], axis=0)
-    enough = np.bincount(cells[judged], minlength=size).reshape(shape) >= fewest
+    is_judged = ~np.all([np.isnan(r) for r in residual.values()], axis=0)
+    enough = np.bincount(cells[is_judged], minlength=size).reshape(shape) >= fewest
     if not enough.any():
         return None
     ratio = {}
     for name, r in residual.items():
-        there = ~np.isnan(r)
-        count = np.bincount(cells[there], minlength=size).reshape(shape)
-        square = np.bincount(cells[there], r[there] ** 2, minlength=size).reshape(shape)
+        has_value = ~np.isnan(r)
+        count = np.bincount(cells[has_value], minlength=size).reshape(shape)
+        square = np.bincount(cells[has_value], r[has_value] ** 2, minlength=size).reshape(shape)
         ratio[name] = np.where(enough & (count > 0), np.sqrt(square / np.maximum(count, 1)) / floor[name], np.nan)
     down, across = (slice(np.flatnonzero(enough.any(axis))[0], np.flatnonzero(enough.any(axis))[-1] + 1)
                     for axis in (1, 0))

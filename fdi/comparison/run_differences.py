@@ -54,8 +54,8 @@ class SignalDifference:
     @property
     def ratio(self) -> float:
         """RMS difference over what the noise of both runs leaves; 1 for two runs that differ only by noise."""
-        if (expected := math.hypot(*self.noise)) > 0.0:
-            return self.rms / expected
+        if (noise := math.hypot(*self.noise)) > 0.0:
+            return self.rms / noise
         return 0.0 if self.rms == 0.0 else float("inf")
 
     @property
@@ -148,8 +148,8 @@ def sample_column(trace: Trace, name: str, t: Floats) -> Floats:
     nearest: Floats = np.rint(rows)
     values = trace.column(name)
     if not len(t) or float(np.abs(rows - nearest).max()) < 0.01:
-        picked: Floats = values[np.clip(nearest.astype(int), 0, len(values) - 1)]
-        return picked
+        samples: Floats = values[np.clip(nearest.astype(int), 0, len(values) - 1)]
+        return samples
     between: Floats = np.interp(rows, np.arange(len(values)), values)
     return between
 
@@ -164,12 +164,12 @@ def _subtract(reference: Run, other: Run) -> RunPair:
     uncovered = max(len(a) * a.period, len(b) * b.period) - overlap
     uncovered = uncovered if uncovered > MOST_UNCOVERED * period else 0.0
     is_same = len(rows.t) > 0 and bool(agrees.mean() > 0.995)  # missing rows and edges of interpolated steps aside
-    differences, found, left_out = {}, [], {}
+    differences, signals, not_compared = {}, [], {}
     d = a.declared
     for name in (*a.output_names, d.drive.name, *([d.load.name] if d.load else [])):
         reason = _find_obstacle(name, reference, other)
         if reason:
-            left_out[name] = reason
+            not_compared[name] = reason
         if reason or name not in a.signals:
             continue
         first, second = rows.sample(name)
@@ -177,32 +177,32 @@ def _subtract(reference: Run, other: Run) -> RunPair:
             continue  # no load in either run
         difference = np.where(agrees, second - first, np.nan)
         if not (~np.isnan(difference)).any():
-            left_out[name] = "no row with equal commands in which both runs have it"
+            not_compared[name] = "no row with equal commands in which both runs have it"
             continue
         differences[name] = difference
         signal = d.find(name)._replace(unit=a.units[name])
-        found.append(_measure_difference(signal, rows.t, difference, (first, second)))
-    return RunPair(other, tuple(found), is_same, common, overlap, uncovered, offset, rows.t, differences, left_out,
-                   tuple(_list_notes(reference, other, offset, agrees, is_same)))
+        signals.append(_measure_difference(signal, rows.t, difference, (first, second)))
+    return RunPair(other, tuple(signals), is_same, common, overlap, uncovered, offset, rows.t, differences,
+                   not_compared, tuple(_list_notes(reference, other, offset, agrees, is_same)))
 
 
 def _find_obstacle(name: str, reference: Run, other: Run) -> str:
     """Why a signal cannot be compared; "" if it can, or if no run has it."""
-    has = [run for run in (reference, other) if name in run.trace.signals]
-    if len(has) == 1:
-        return f"only {has[0].label} has it"
+    runs = [run for run in (reference, other) if name in run.trace.signals]
+    if len(runs) == 1:
+        return f"only {runs[0].label} has it"
     a, b = (run.trace.units.get(name, "") for run in (reference, other))
-    return f"in {a} in {reference.label}, in {b} in {other.label}" if has and a != b else ""
+    return f"in {a} in {reference.label}, in {b} in {other.label}" if runs and a != b else ""
 
 
 def _measure_difference(signal: Signal, t: Floats, difference: Floats,
                         columns: tuple[Floats, Floats]) -> SignalDifference:
-    known = np.flatnonzero(~np.isnan(difference))
-    row = int(known[np.argmax(np.abs(difference[known]))])
+    rows = np.flatnonzero(~np.isnan(difference))
+    row = int(rows[np.argmax(np.abs(difference[rows]))])
     noise = [max(float(floor_from_data(column).value), signal.finest) for column in columns]
-    calm = np.abs(difference[known]) <= NOISE_BAND_RATIO * math.hypot(*noise)
+    calm = np.abs(difference[rows]) <= NOISE_BAND_RATIO * math.hypot(*noise)
     return SignalDifference(signal, rms(difference), float(difference[row]), float(t[row]), (noise[0], noise[1]),
-                            len(known), float(calm.mean()), not difference[known].any())
+                            len(rows), float(calm.mean()), not difference[rows].any())
 
 
 def find_offset(a: Trace, b: Trace) -> float:
@@ -296,10 +296,10 @@ class MatchedCheck:
     @property
     def has_other_limits(self) -> bool:
         """Whether the runs that have the check judged it by different limits, or in different units."""
-        known = [check for check in self.results if check is not None]
-        return any((check.unit, check.kind) != (known[0].unit, known[0].kind)
-                   or not np.array_equal([check.low, check.high], [known[0].low, known[0].high], equal_nan=True)
-                   for check in known)
+        checks = [check for check in self.results if check is not None]
+        return any((check.unit, check.kind) != (checks[0].unit, checks[0].kind)
+                   or not np.array_equal([check.low, check.high], [checks[0].low, checks[0].high], equal_nan=True)
+                   for check in checks)
 
 
 def match_checks(checks_of_runs: Sequence[Sequence[CheckResult]]) -> list[MatchedCheck]:
