@@ -29,13 +29,13 @@ Group = tuple[str, ...]  # names of faults of which at least one has grown, and 
 class _Region:
     """The posterior of the scaled sizes of the faults, (f,), and their bounds."""
 
-    def __init__(self, found: Refinement) -> None:
-        names = [f.name for f in found.fit.free]
-        self.faults = found.faults
-        self.places = [names.index(fault.parameter) for fault in found.faults]
-        self.free = [found.fit.free[k] for k in self.places]
-        self.x = found.fit.x[self.places]
-        covariance = found.fit.covariance[np.ix_(self.places, self.places)]
+    def __init__(self, refinement: Refinement) -> None:
+        names = [f.name for f in refinement.fit.free]
+        self.faults = refinement.faults
+        self.places = [names.index(fault.parameter) for fault in refinement.faults]
+        self.free = [refinement.fit.free[k] for k in self.places]
+        self.x = refinement.fit.x[self.places]
+        covariance = refinement.fit.covariance[np.ix_(self.places, self.places)]
         values, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
         self.root = (axes / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T  # |root (x - x0)|: distance, s.d.
         self.spread = np.sqrt(np.diag(covariance))
@@ -88,44 +88,44 @@ class _Region:
         return groups
 
 
-def cut_intervals(found: Refinement, names: Sequence[str], sizes: Mapping[str, Estimate]) -> dict[str, Estimate]:
+def cut_intervals(refinement: Refinement, names: Sequence[str], sizes: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """The intervals of these faults within the bounds of all faults; those that this makes no narrower stay."""
-    region = _Region(found)
-    cut = {}
-    for i, fault in enumerate(found.faults):
-        if fault.name in names and len(found.faults) > 1:
-            ends, known = region.find_ends(i, fault.interval_factor), sizes[fault.name]
-            cut[fault.name] = Estimate(known.value, max(known.low, ends.low), min(known.high, ends.high))
-    return cut
+    region = _Region(refinement)
+    intervals = {}
+    for i, fault in enumerate(refinement.faults):
+        if fault.name in names and len(refinement.faults) > 1:
+            ends, size = region.find_ends(i, fault.interval_factor), sizes[fault.name]
+            intervals[fault.name] = Estimate(size.value, max(size.low, ends.low), min(size.high, ends.high))
+    return intervals
 
 
-def find_groups(found: Refinement, levels: Mapping[str, Level | None], tolerances: Mapping[str, float] | None = None
-                ) -> tuple[Group, ...]:
+def find_groups(refinement: Refinement, levels: Mapping[str, Level | None],
+                tolerances: Mapping[str, float] | None = None) -> tuple[Group, ...]:
     """Groups of faults that change the signals alike, of which no unit that is healthy in all of them fits.
 
     Args:
-        found: the fit.
+        refinement: the fit.
         levels: of all faults by name. Each group has one that cannot be judged, None; one that is acceptable by itself
             may stand for it.
         tolerances: relative ones of parameters that differ from one healthy unit to the next.
     """
-    region = _Region(found)
+    region = _Region(refinement)
     groups = []
-    undecided, others = ([i for i, f in enumerate(found.faults) if levels[f.name] == level]
+    undecided, others = ([i for i, f in enumerate(refinement.faults) if levels[f.name] == level]
                          for level in (None, Level.ACCEPTABLE))
     for members in region.group_alike(undecided):
         group = sorted([*members, *(j for j in others if region.alike[j, members].any())])
         low, high = region.low.copy(), region.high.copy()
         for i in group:
-            region.limit_to_healthy(low, high, i, (tolerances or {}).get(found.faults[i].parameter, 0.0))
-        if len(group) > 1 and region.measure_distance(low, high) > _exclude_all(len(group), len(found.faults)):
-            groups.append(tuple(found.faults[i].name for i in group))
+            region.limit_to_healthy(low, high, i, (tolerances or {}).get(refinement.faults[i].parameter, 0.0))
+        if len(group) > 1 and region.measure_distance(low, high) > _exclude_all(len(group), len(refinement.faults)):
+            groups.append(tuple(refinement.faults[i].name for i in group))
     return tuple(groups)
 
 
-def _exclude_all(together: int, tested: int) -> float:
+def _exclude_all(group_size: int, tested: int) -> float:
     """Distance, standard deviations, from which on so many sizes together are not healthy: chi-squared of as many
     degrees of freedom, at the level at which one of more than two faults is judged.
     """
     limit = INTERVAL_95_SD * widen_for_many(tested)
-    return math.sqrt(chdtri(together, chdtrc(1, limit**2))) if tested > 2 else limit
+    return math.sqrt(chdtri(group_size, chdtrc(1, limit**2))) if tested > 2 else limit

@@ -105,20 +105,20 @@ class StepBand(NamedTuple):
     def compute_centre(self, fault: BandFault, amount: float) -> tuple[Floats, Floats]:
         """Mean and standard deviation, (K,) each, with this `amount` of a friction."""
         weights = np.array([np.interp(amount, fault.amounts, row) for row in np.eye(len(fault.amounts))])
-        own = self.frictions[fault.name]
-        return self.healthy + weights @ own.shift, weights @ own.spread
+        friction = self.frictions[fault.name]
+        return self.healthy + weights @ friction.shift, weights @ friction.spread
 
-    def compute_centres(self, shown: Mapping[str, Sequence[float]], bands: Bands) -> list[tuple[Floats, Floats]]:
-        """Mean and standard deviation with each amount of each friction that is `shown`; of healthy units without."""
-        return [self.compute_centre(bands.find(name), amount) for name, amounts in shown.items()
-                for amount in amounts] or [(self.healthy, self.spread)]
+    def compute_centres(self, amounts: Mapping[str, Sequence[float]], bands: Bands) -> list[tuple[Floats, Floats]]:
+        """Mean and standard deviation with each of these `amounts` of frictions; of healthy units without any."""
+        return [self.compute_centre(bands.find(name), amount) for name, pair in amounts.items()
+                for amount in pair] or [(self.healthy, self.spread)]
 
     def compute_margins(self, fault: BandFault, spread: Floats) -> tuple[Floats, Floats, Flags]:
         """Distances of the limits MidBand and MaxBand from the centre, and where the step is judged; (K,) each."""
         lesser, greater = np.abs(self.middle[fault.name]), np.abs(self.most[fault.name])
-        judged = lesser > BAND_FAULT_CLEARANCE_SD * spread
+        is_judged = lesser > BAND_FAULT_CLEARANCE_SD * spread
         middle = np.maximum(fault.middle_share * lesser, BAND_NEAREST_LIMIT_SD * spread)
-        return middle, np.maximum(fault.most_share * greater, middle), judged
+        return middle, np.maximum(fault.most_share * greater, middle), is_judged
 
 
 class Width(NamedTuple):
@@ -160,8 +160,8 @@ class RampBand(NamedTuple):
         """
         if self.slip <= 0.0 or dynamic >= 1.0:
             return 1.0
-        own = fastest / (self.compute_scale(half, fastest) * half) if half > 0.0 else self.slip
-        return float(np.clip((1 - (1 - dynamic) * own / self.slip) / dynamic, 0.0, 1 / dynamic))
+        slip = fastest / (self.compute_scale(half, fastest) * half) if half > 0.0 else self.slip
+        return float(np.clip((1 - (1 - dynamic) * slip / self.slip) / dynamic, 0.0, 1 / dynamic))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,13 +202,13 @@ def is_friction_fault(fault: Fault) -> bool:
 # Which bands a trace is judged by
 # ---------------------------------------------------------------------------------------------------------------------
 
-def require_same_command(bands: Bands, found: Sequence[Section], period: float, where: object) -> None:
+def require_same_command(bands: Bands, parts: Sequence[Section], period: float, where: object) -> None:
     """Refuse bands of another command.
 
     Raises:
         InputError: the first difference.
     """
-    if difference := find_difference(bands, found, period):
+    if difference := find_difference(bands, parts, period):
         kinds = [s.kind for s in bands.sections]
         name = " ".join([bands.provenance.get("command", ""), f"({kinds.count('step')} steps,"]).strip()
         raise InputError(where, bands.kind.signals.command.name,
@@ -216,18 +216,18 @@ def require_same_command(bands: Bands, found: Sequence[Section], period: float, 
                          "(rig fdi --learn-bands makes bands of it)")
 
 
-def find_difference(bands: Bands, found: Sequence[Section], period: float) -> str:
+def find_difference(bands: Bands, parts: Sequence[Section], period: float) -> str:
     """The first difference between a command's sections and those of the bands, in words; "" if it is the same command.
 
     How long a test rests before and after its steps and ramps does not matter.
     """
-    mine, theirs = ([s for s in parts if s.kind in ("step", "ramp")] for parts in (bands.sections, found))
-    if len(mine) != len(theirs):
-        return f"this one has {count_nouns(len(theirs), 'section')}"
+    band_sections, sections = ([s for s in every if s.kind in ("step", "ramp")] for every in (bands.sections, parts))
+    if len(band_sections) != len(sections):
+        return f"this one has {count_nouns(len(sections), 'section')}"
     same = SAME_COMMAND_POSITION * bands.scale
-    for a, b in zip(mine, theirs, strict=True):
-        start = (b.start - theirs[0].start) * period
-        near = (abs((a.start - mine[0].start) * bands.period - start) < SAME_COMMAND_TIME
+    for a, b in zip(band_sections, sections, strict=True):
+        start = (b.start - sections[0].start) * period
+        near = (abs((a.start - band_sections[0].start) * bands.period - start) < SAME_COMMAND_TIME
                 and abs(a.first - b.first) < same and abs(a.last - b.last) < same
                 and abs(a.rate - b.rate) <= SAME_COMMAND_RATE * abs(a.rate) + 1e-6 * bands.scale)
         if a.kind != b.kind or not near:
@@ -250,10 +250,10 @@ def is_loaded(load: Floats, kind: Plant) -> bool:
 def list_design(model: Model, faults: Iterable[Fault]) -> dict[str, float]:
     """The parameters in which a healthy unit of the model differs from a nominal one, SI: not those of faults or noise.
     """
-    own = {name for fault in faults for name in fault.parameters}
+    fault_parameters = {name for fault in faults for name in fault.parameters}
     noise = {signal.noise for signal in model.kind.signals}
     return {name: value for name, value in sorted(model.list_changes().items())
-            if name not in own and name not in noise and not name.startswith("sensors.")}
+            if name not in fault_parameters and name not in noise and not name.startswith("sensors.")}
 
 
 def format_design(model: Model, faults: Iterable[Fault]) -> str:
@@ -264,10 +264,10 @@ def format_design(model: Model, faults: Iterable[Fault]) -> str:
 def describe_other_model(bands: Bands, model: Model) -> str:
     """Which model bands were made for, if it is another than `model`; else ""."""
     name, plant = bands.provenance.get("model", "eha"), bands.provenance.get("plant", "eha")
-    known = bands.provenance.get("parameters", "{}")
-    if (plant, known) == (model.kind.name, format_design(model, bands.faults)):
+    parameters = bands.provenance.get("parameters", "{}")
+    if (plant, parameters) == (model.kind.name, format_design(model, bands.faults)):
         return ""
-    design = known.strip("{}").replace('"', "").replace(":", " =") or "all parameters nominal"
+    design = parameters.strip("{}").replace('"', "").replace(":", " =") or "all parameters nominal"
     return f"the model {name} with {design}"
 
 
@@ -325,22 +325,24 @@ def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: F
         most, signal = float(np.nanmax(np.abs(load))), bands.kind.signals.load
         unit = signal.unit if signal is not None else ""
         raise InputError(where, "load", f"none, as these bands are of an unloaded plant, not {most:.3g} {unit}")
-    found, shown, notes = find_excursions(com, xj, period, bands, parts)
-    levels, severity, events = {}, {}, {i: [*_find_events(e, t0, period, bands.unit)] for i, e in enumerate(found)}
+    excursions, amounts, notes = find_excursions(com, xj, period, bands, parts)
+    levels, severity, events = {}, {}, {i: [*_find_events(e, t0, period, bands.unit)] for i, e in enumerate(excursions)}
     for fault in bands.faults:
-        own = [i for i, e in enumerate(found) if e.fault == fault.name and e.signal == "position" and e.is_judged]
-        if own:
-            severity[fault.name] = max(0.0, *(found[i].measure_peak() for i in own))
-            levels[fault.name] = max((LEVELS[event.band] for i in own for event in events[i]), default=Level.ACCEPTABLE)
+        indices = [i for i, e in enumerate(excursions)
+                   if e.fault == fault.name and e.signal == "position" and e.is_judged]
+        if indices:
+            severity[fault.name] = max(0.0, *(excursions[i].measure_peak() for i in indices))
+            levels[fault.name] = max((LEVELS[event.band] for i in indices for event in events[i]),
+                                     default=Level.ACCEPTABLE)
         else:
-            units = "units with the friction that the ramps show" if shown else "healthy units"
+            units = "units with the friction that the ramps show" if amounts else "healthy units"
             notes.append(f"{fault.name} is not judged by bands: " + (
                 f"a fault at MidBand is within the scatter of {units}"
-                if any(e.fault == fault.name for e in found) else "no section of the trace shows it"))
-    gone = {f: (levels[f], severity[f]) for f in levels if levels[f] > Level.ACCEPTABLE}
-    ruling = max(gone, key=lambda f: gone[f]) if gone else None
-    every = sorted(chain.from_iterable(events.values()), key=lambda event: event.t_in)
-    return BandVerdict(levels, ruling, tuple(every), severity, shown, tuple(notes))
+                if any(e.fault == fault.name for e in excursions) else "no section of the trace shows it"))
+    ranks = {f: (levels[f], severity[f]) for f in levels if levels[f] > Level.ACCEPTABLE}
+    ruling = max(ranks, key=lambda f: ranks[f]) if ranks else None
+    all_events = sorted(chain.from_iterable(events.values()), key=lambda event: event.t_in)
+    return BandVerdict(levels, ruling, tuple(all_events), severity, amounts, tuple(notes))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -361,8 +363,8 @@ class Excursion(NamedTuple):
     @property
     def is_judged(self) -> bool:
         """Whether a limit applies to known samples for as long as an event lasts."""
-        limited = np.isfinite(self.departure) & np.isfinite(self.middle)
-        return bool(find_lasting_peak(limited.astype(float)) > 0.0)
+        has_limit = np.isfinite(self.departure) & np.isfinite(self.middle)
+        return bool(find_lasting_peak(has_limit.astype(float)) > 0.0)
 
     def measure_peak(self) -> float:
         """The furthest lasting departure, in limits of MidBand."""
@@ -375,57 +377,58 @@ def find_excursions(com: Floats, xj: Floats, period: float, bands: Bands, parts:
     place = place_sections(bands, parts)
     notes: list[str] = []
     out: list[Excursion] = []
-    shown: dict[str, list[tuple[float, float]]] = {fault.name: [] for fault in bands.faults if len(fault.amounts)}
-    lost: dict[int, bool] = {}
+    ramp_pairs: dict[str, list[tuple[float, float]]] = {fault.name: [] for fault in bands.faults if len(fault.amounts)}
+    is_lost: dict[int, bool] = {}
     for ramp in bands.ramps:
         s = place[ramp.section]
         error, beyond = measure_ramp(xj, com, s, period)
-        if ramp.section not in lost:
-            lost[ramp.section] = _is_lost(error, s, bands, notes)
-        if lost[ramp.section]:
+        if ramp.section not in is_lost:
+            is_lost[ramp.section] = _is_lost(error, s, bands, notes)
+        if is_lost[ramp.section]:
             continue
         half = float(compute_half_range(error))
         fastest = float(find_lasting_peak(beyond))
         scale, fault = ramp.compute_scale(half, fastest), bands.find(ramp.fault)
         if len(fault.amounts):
             amount = float(np.interp(scale * half, ramp.half_range, fault.amounts))
-            shown[fault.name].append((amount, amount * ramp.estimate_friction_ratio(half, fastest, fault.dynamic)))
+            ramp_pairs[fault.name].append((amount, amount * ramp.estimate_friction_ratio(half, fastest, fault.dynamic)))
         for signal, x, width in (("position", scale * (error - ramp.position.centre), ramp.position),
                                  ("speed", beyond - ramp.speed.centre, ramp.speed)):
             middle, most = (np.full(len(x), limit) for limit in (width.middle, width.most))
             out.append(Excursion(signal, s, select_ramp_rows(s, period).start, np.abs(x), middle, most, fault.name))
     amounts: dict[str, Sequence[float]] = {
         name: np.mean(pairs, axis=0).tolist() if pairs else [float(bands.find(name).amounts[0])] * 2
-        for name, pairs in shown.items()}
-    if bands.ramps and shown and not any(shown.values()):
+        for name, pairs in ramp_pairs.items()}
+    if bands.ramps and ramp_pairs and not any(ramp_pairs.values()):
         notes.append("steps are judged as if friction were healthy: no ramp shows how much there is")
     for step in bands.steps:
-        own = [_make_step_excursion(xj, period, bands, step, place[step.section], amounts, bands.find(name))
-               for name in step.middle]
-        rows = slice(own[0].start, own[0].start + len(own[0].departure)) if own else slice(0)
-        if own and not _is_lost(xj[rows], own[0].section, bands, notes):
-            out += own
+        excursions = [_make_step_excursion(xj, period, bands, step, place[step.section], amounts, bands.find(name))
+                      for name in step.middle]
+        rows = (slice(excursions[0].start, excursions[0].start + len(excursions[0].departure)) if excursions
+                else slice(0))
+        if excursions and not _is_lost(xj[rows], excursions[0].section, bands, notes):
+            out += excursions
     return out, amounts, notes
 
 
 def place_sections(bands: Bands, parts: Iterable[Section]) -> dict[int, Section]:
     """A trace's sections, which are those of the same command, by their number in the bands."""
-    known = [i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")]
-    return dict(zip(known, [s for s in parts if s.kind in ("step", "ramp")], strict=True))
+    numbers = [i for i, s in enumerate(bands.sections) if s.kind in ("step", "ramp")]
+    return dict(zip(numbers, [s for s in parts if s.kind in ("step", "ramp")], strict=True))
 
 
 def _is_lost(x: Floats, s: Section, bands: Bands, notes: list[str]) -> bool:
     """Whether too much of a section is missing to judge it; if so, with a note."""
-    lost = float(np.isnan(x).mean()) if len(x) else 1.0
-    too_much = lost > 1.0 - SECTION_MEASURED_SHARE
+    missing_share = float(np.isnan(x).mean()) if len(x) else 1.0
+    too_much = missing_share > 1.0 - SECTION_MEASURED_SHARE
     if too_much:
-        notes.append(f"{describe_section(s, unit=bands.unit)} is not judged: {100 * lost:.0f} % of its position is "
-                     "missing")
+        notes.append(f"{describe_section(s, unit=bands.unit)} is not judged: {100 * missing_share:.0f} % of its "
+                     "position is missing")
     return too_much
 
 
 def _make_step_excursion(xj: Floats, period: float, bands: Bands, step: StepBand, s: Section,
-                         shown: Mapping[str, Sequence[float]], fault: BandFault) -> Excursion:
+                         amounts: Mapping[str, Sequence[float]], fault: BandFault) -> Excursion:
     """Departure towards a fault; NaN on rows without a limit.
 
     A step is delayed by the sliding friction and scatters with the static one. So both amounts of each friction are
@@ -435,11 +438,11 @@ def _make_step_excursion(xj: Floats, period: float, bands: Bands, step: StepBand
     rows = np.arange(first, min(stop, s.stop - s.start))
     at = rows * period
     towards = np.sign(np.interp(at, step.t, step.middle[fault.name]))
-    centres, spreads = zip(*step.compute_centres(shown, bands), strict=True)
-    middle, most, judged = step.compute_margins(fault, np.max(spreads, axis=0))
-    off = [towards * (xj[s.start + rows] - np.interp(at, step.t, centre)) for centre in centres]
-    x = np.min(np.abs(off) if fault.both_ways else off, axis=0)
-    x = np.where(np.interp(at, step.t, judged.astype(float)) > 0.99, x, np.nan)
+    centres, spreads = zip(*step.compute_centres(amounts, bands), strict=True)
+    middle, most, is_judged = step.compute_margins(fault, np.max(spreads, axis=0))
+    departures = [towards * (xj[s.start + rows] - np.interp(at, step.t, centre)) for centre in centres]
+    x = np.min(np.abs(departures) if fault.both_ways else departures, axis=0)
+    x = np.where(np.interp(at, step.t, is_judged.astype(float)) > 0.99, x, np.nan)
     return Excursion("position", s, s.start + first, x, np.interp(at, step.t, middle), np.interp(at, step.t, most),
                      fault.name)
 
@@ -517,8 +520,8 @@ def format_bands(bands: Bands) -> str:
         for key in ("middle", "most"):
             lines += [f"{key}.{name} = {_format_list(x[::KNOT_CYCLES] / count, 1)}"
                       for name, x in getattr(step, key).items()]
-        for name, own in step.frictions.items():
-            for key, values, places in (("shift", own.shift, 1), ("scatter", own.spread, 2)):
+        for name, friction in step.frictions.items():
+            for key, values, places in (("shift", friction.shift, 1), ("scatter", friction.spread, 2)):
                 rows = [f"  {_format_list(row[::KNOT_CYCLES] / count, places)}," for row in values[1:]]
                 lines += [f"{key}.{name} = [", *rows, "]"]
     for ramp in bands.ramps:
@@ -527,8 +530,8 @@ def format_bands(bands: Bands) -> str:
                   f"speed = {_format_numbers(ramp.speed._asdict(), SPEED_COUNT * count)}",
                   *([f"half_range = {_format_list(ramp.half_range / count, 2)}", f"slip = {ramp.slip:.4g}",
                      f"ease = {ramp.ease:.4g}"] if len(ramp.half_range) else [])]
-    lines += ["", "[precursors]", *(f"{name if BARE.fullmatch(name) else json.dumps(name)} = {_format_numbers(own)}"
-                                    for name, own in bands.precursors.items())]
+    lines += ["", "[precursors]", *(f"{name if BARE.fullmatch(name) else json.dumps(name)} = {_format_numbers(numbers)}"
+                                    for name, numbers in bands.precursors.items())]
     return "\n".join(lines) + "\n"
 
 
@@ -540,14 +543,14 @@ def parse_bands(content: str, where: object, kind: Plant | None = None) -> Bands
     """
     table, kind = parse_toml(content, where), kind or find_plant("eha")
     try:
-        found = _read_bands(table, kind)
+        bands = _read_bands(table, kind)
     except KeyError as error:
         raise InputError(where, str(error.args[0]), "a file of bands, which has this key") from error
     except (TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         raise InputError(where, "", f"a file of bands as rig fdi --learn-bands writes it ({error})") from error
-    require((own := found.provenance.get("plant", "eha")) == kind.name, where, "plant",
-            f"bands of the plant {kind.name}, not of {own}")
-    return found
+    require((plant := bands.provenance.get("plant", "eha")) == kind.name, where, "plant",
+            f"bands of the plant {kind.name}, not of {plant}")
+    return bands
 
 
 def _read_bands(table: Mapping[str, Any], kind: Plant) -> Bands:
@@ -557,17 +560,17 @@ def _read_bands(table: Mapping[str, Any], kind: Plant) -> Bands:
     provenance = dict(table["provenance"])
     parts = tuple(Section(part, int(a), int(b), first / per_unit, last / per_unit, rate / per_unit)
                   for part, a, b, first, last, rate in provenance.pop("sections"))
-    known = []
+    faults = []
     for name, values in table["faults"].items():
         amounts = np.array(values.pop("amounts", ()), float)
         if not (np.diff(amounts) > 0.0).all():
             raise ValueError("amounts: rising values")
-        known.append(BandFault(name, name.replace("_", " "), range=(-math.inf, math.inf), amounts=amounts, **values))
+        faults.append(BandFault(name, name.replace("_", " "), range=(-math.inf, math.inf), amounts=amounts, **values))
     places = {part: [i for i, s in enumerate(parts) if s.kind == part] for part in ("step", "ramp")}
-    by_name = {fault.name: fault for fault in known}
+    by_name = {fault.name: fault for fault in faults}
     steps = tuple(_read_step(step, period, by_name, places["step"], per_unit) for step in table.get("step", ()))
     ramps = tuple(_read_ramp(ramp, by_name, places["ramp"], per_unit) for ramp in table.get("ramp", ()))
-    return Bands(kind, parts, period, scale, tuple(known), steps, ramps,
+    return Bands(kind, parts, period, scale, tuple(faults), steps, ramps,
                  {key: str(value) for key, value in provenance.items()},
                  {name: {key: float(value) for key, value in numbers.items()}
                   for name, numbers in table.get("precursors", {}).items()})

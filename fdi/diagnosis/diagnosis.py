@@ -129,22 +129,22 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     precursors = measure_precursors(trace, bands.precursors if bands is not None else None)
     progress("grid", 0.05)
     floor = {name: f.value for name, f in sensor_floors(trace, model).items()}
-    fitted = moving = leave_out_rest(trace, model)
-    notes += moving.notes[len(trace.notes):]
+    fitted_trace = moving_trace = leave_out_rest(trace, model)
+    notes += moving_trace.notes[len(trace.notes):]
     if is_long(trace):
-        excerpt = choose_size_excerpt(model, moving, floor, progress, faults)
-        fitted = cut_excerpt(moving, excerpt)
+        excerpt = choose_size_excerpt(model, moving_trace, floor, progress, faults)
+        fitted_trace = cut_excerpt(moving_trace, excerpt)
         notes.append(excerpt.describe(trace))
-    grids = _search_grids(fitted, model, [faults] if len(faults) == 2 else [], notes)
+    grids = _search_grids(fitted_trace, model, [faults] if len(faults) == 2 else [], notes)
     if with_effects:
         progress("refinement", 0.07)
     starts = [start for grid in grids for start in grid.starts]
-    refinement = refine_sizes(model, fitted, (*starts, *list_coarse_starts(faults)), floor, workers, moving,
+    refinement = refine_sizes(model, fitted_trace, (*starts, *list_coarse_starts(faults)), floor, workers, moving_trace,
                               ignore_progress if with_effects else progress, faults)
     sizes = _widen_intervals(refinement)
     beside = None
     if with_effects:
-        beside = find_effects_beside(model, fitted, refinement, floor, progress, workers, moving)
+        beside = find_effects_beside(model, fitted_trace, refinement, floor, progress, workers, moving_trace)
         refinement = beside.best.refinement
         sizes = dict(beside.sizes) if refinement.is_explained else _widen_intervals(refinement)
     levels = _judge_sizes(sizes, refinement)
@@ -157,7 +157,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
         levels |= dict.fromkeys(beside.disputed)
     if len(faults) > 2:
         progress("grid", 0.98)
-        grids = _search_grids(fitted, model, _choose_pairs(faults, sizes, levels), notes)
+        grids = _search_grids(fitted_trace, model, _choose_pairs(faults, sizes, levels), notes)
     progress("done", 1.0)
     return Diagnosis(source=source, faults=faults, levels=levels, groups=groups,
                      verdict=_decide_verdict(levels, groups, refinement.is_explained),
@@ -169,16 +169,16 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
 def _choose_pairs(faults: Sequence[Fault], sizes: Mapping[str, Estimate], levels: Mapping[str, Level | None],
                   most: int = 3) -> list[tuple[Fault, Fault]]:
     """The pairs of faults to draw maps of: of those that are not acceptable, and of the two that are furthest gone."""
-    ranked = sorted(faults, key=lambda f: (levels[f.name] == Level.ACCEPTABLE, -compute_severity(
+    ranking = sorted(faults, key=lambda f: (levels[f.name] == Level.ACCEPTABLE, -compute_severity(
         f, sizes[f.name].value)))
-    gone = sum(levels[f.name] != Level.ACCEPTABLE for f in faults)
-    return list(combinations([f for f in faults if f in ranked[:min(max(gone, 2), most)]], 2))
+    count = sum(levels[f.name] != Level.ACCEPTABLE for f in faults)
+    return list(combinations([f for f in faults if f in ranking[:min(max(count, 2), most)]], 2))
 
 
 def _require_bands_of(bands: Bands, model: Model, faults: Sequence[Fault]) -> Bands:
     """Bands of another unit, or of none of these faults, are refused."""
-    require(any(own.is_of(fault) for own in bands.faults for fault in faults), "--bands",
-            f"of {', '.join(own.name for own in bands.faults)}",
+    require(any(band_fault.is_of(fault) for band_fault in bands.faults for fault in faults), "--bands",
+            f"of {', '.join(band_fault.name for band_fault in bands.faults)}",
             "bands of one of these faults with the same limits; rig fdi --learn-bands --faults FILE makes them")
     if other := describe_other_model(bands, model):
         design = ", ".join(f"{name} = {value:g}" for name, value in list_design(model, bands.faults).items())
@@ -189,19 +189,19 @@ def _require_bands_of(bands: Bands, model: Model, faults: Sequence[Fault]) -> Ba
 
 def _find_own_bands(trace: Trace, model: Model, faults: Sequence[Fault], notes: list[str]) -> Bands | None:
     """The bands that come with the software if they fit; a note if they do not."""
-    own = load_default_bands()
+    bands = load_default_bands()
     for fits, reason in (
-            (model.kind.name == own.kind.name and all(any(known.is_of(f) for f in faults) for known in own.faults),
+            (model.kind.name == bands.kind.name and all(any(b.is_of(f) for f in faults) for b in bands.faults),
              "the software's own are of the paper's faults; rig fdi --learn-bands makes others"),
-            (not describe_other_model(own, model),
+            (not describe_other_model(bands, model),
              "the software's own are of the nominal unit; rig fdi --learn-bands makes others"),
             (not is_loaded(trace.load, model.kind), "the plant is loaded, and the software's own are of a free one"),
-            (matches_command(own, trace.command, trace.period),
+            (matches_command(bands, trace.command, trace.period),
              "the software's own are of the preflight command, this is another")):
         if not fits:
             notes.append(f"no bands: {reason}")
             return None
-    return own
+    return bands
 
 
 def _search_grids(trace: Trace, model: Model, pairs: Sequence[Sequence[Fault]], notes: list[str]) -> tuple[Grid, ...]:
@@ -231,12 +231,12 @@ def _find_unhealthy(refinement: Refinement, model: Model) -> dict[str, Estimate]
     return {name: e for name, e in refinement.others.items() if _is_unhealthy(name, e, model)}
 
 
-def _widen_intervals(found: Refinement) -> dict[str, Estimate]:
+def _widen_intervals(refinement: Refinement) -> dict[str, Estimate]:
     """The sizes of the faults; where more than noise is left, their intervals are wider by as much."""
-    wider = 1.0 if found.is_explained else max(found.ratio.values())
+    wider = 1.0 if refinement.is_explained else max(refinement.ratio.values())
     return {f.name: Estimate(e.value, max(e.value - wider * (e.value - e.low), f.range[0]),
                              min(e.value + wider * (e.high - e.value), f.range[1]))
-            for f in found.faults for e in (found.sizes[f.name],)}
+            for f in refinement.faults for e in (refinement.sizes[f.name],)}
 
 
 def _decide_verdict(levels: Mapping[str, Level | None], groups: Sequence[Group], is_explained: bool) -> str:

@@ -48,8 +48,8 @@ class Estimate(NamedTuple):
 def list_fault_files() -> list[str]:
     """Names of the lists of faults that come with the software."""
     start, end = SHIPPED.split("{}")
-    found = [entry.name for entry in files("fdi.diagnosis").iterdir()]
-    return sorted(name[len(start):-len(end)] for name in found if name.startswith(start) and name.endswith(end))
+    names = [entry.name for entry in files("fdi.diagnosis").iterdir()]
+    return sorted(name[len(start):-len(end)] for name in names if name.startswith(start) and name.endswith(end))
 
 
 def load_faults(source: str | Path = "paper", kind: Plant | None = None) -> tuple[Fault, ...]:
@@ -120,8 +120,8 @@ def measure_departures(fault: Fault, size: Estimate) -> Estimate:
     """An estimate as departures, larger is worse; the least one is 0 where the interval of both ways is on both sides.
     """
     ends = sorted(fault.measure_departure(x) for x in size[1:])
-    inside = fault.both_ways and size.low < fault.healthy < size.high
-    return Estimate(fault.measure_departure(size.value), 0.0 if inside else ends[0], ends[1])
+    is_inside = fault.both_ways and size.low < fault.healthy < size.high
+    return Estimate(fault.measure_departure(size.value), 0.0 if is_inside else ends[0], ends[1])
 
 
 def classify_size(fault: Fault, value: float) -> Level:
@@ -139,5 +139,5 @@ def compute_severity(fault: Fault, value: float) -> float:
 def find_ruling_fault(faults: Sequence[Fault], sizes: Mapping[str, Estimate], levels: Mapping[str, Level | None]
                       ) -> str | None:
     """Name of the most severe of the faults that are not acceptable; None if there is none."""
-    gone = [f for f in faults if levels.get(f.name) not in (None, Level.ACCEPTABLE)]
-    return max(gone, key=lambda f: compute_severity(f, sizes[f.name].value)).name if gone else None
+    candidates = [f for f in faults if levels.get(f.name) not in (None, Level.ACCEPTABLE)]
+    return max(candidates, key=lambda f: compute_severity(f, sizes[f.name].value)).name if candidates else None

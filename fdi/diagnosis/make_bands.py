@@ -77,10 +77,11 @@ def choose_bands(com: Floats, load: Floats, period: float, model: Model | None =
         progress: called with each stage and the share done, 0 to 1.
         faults: what the bands are to judge.
     """
-    model, own = model or load_model(), load_default_bands()
-    if (not describe_other_model(own, model) and not is_loaded(load, model.kind) and matches_command(own, com, period)
-            and len(faults) == len(own.faults) and all(a.is_of(b) for a, b in zip(own.faults, faults, strict=True))):
-        return own
+    model, bands = model or load_model(), load_default_bands()
+    if (not describe_other_model(bands, model) and not is_loaded(load, model.kind)
+            and matches_command(bands, com, period) and len(faults) == len(bands.faults)
+            and all(a.is_of(b) for a, b in zip(bands.faults, faults, strict=True))):
+        return bands
     return make_bands_by_simulation(model, com, np.nan_to_num(load), period, *BAND_UNITS_QUICK, progress=progress,
                                     faults=faults)
 
@@ -136,35 +137,36 @@ def make_bands_by_simulation(model: Model, com: Floats, load: Floats, period: fl
     healthy = draw("healthy", {}, count)
     limits = {f.name: tuple(f.place_size(x) for x in f.limits[1:]) for f in faults}
     frictions = [f for f in faults if is_friction_fault(f)]
-    others = [f for f in faults if f not in frictions]
+    other_faults = [f for f in faults if f not in frictions]
     amounts = {f.name: _list_amounts(f, float(model[f.parameter])) for f in frictions}
-    rubbing = {f.name: [healthy, *(draw_fault(f, size) for size in amounts[f.name][1:])] for f in frictions}
-    faulted = {f.name: tuple(draw_fault(f, size) for size in limits[f.name]) for f in others}
-    stepped = tuple(_make_step_band(i, s, period, healthy, rubbing, faulted)
-                    for i, s in enumerate(parts) if s.kind == "step")
+    friction_runs = {f.name: [healthy, *(draw_fault(f, size) for size in amounts[f.name][1:])] for f in frictions}
+    fault_runs = {f.name: tuple(draw_fault(f, size) for size in limits[f.name]) for f in other_faults}
+    step_bands = tuple(_make_step_band(i, s, period, healthy, friction_runs, fault_runs)
+                       for i, s in enumerate(parts) if s.kind == "step")
     ramps = [(i, s) for i, s in enumerate(parts) if is_slow_ramp(s, period, scale)]
-    ramped = []
+    ramp_bands = []
     for f in frictions:
-        runs, at = rubbing[f.name], [amounts[f.name].index(size) for size in limits[f.name]]
+        runs, at = friction_runs[f.name], [amounts[f.name].index(size) for size in limits[f.name]]
         easy = [draw_fault(f, limits[f.name][0], LOW_DYNAMIC_SHARE)] if f.follow else []
-        ramped += [_make_friction_ramp(i, s, com, period, f.name, runs, at, easy) for i, s in ramps]
+        ramp_bands += [_make_friction_ramp(i, s, com, period, f.name, runs, at, easy) for i, s in ramps]
     if not frictions:
-        ramped = [_make_ramp_band(i, s, com, period, f.name, (healthy, *faulted[f.name]))
-                  for i, s in ramps for f in others]
-    tables = {f.name: faulted[f.name][0] if f in others else
-              rubbing[f.name][amounts[f.name].index(limits[f.name][0])] for f in faults}
+        ramp_bands = [_make_ramp_band(i, s, com, period, f.name, (healthy, *fault_runs[f.name]))
+                      for i, s in ramps for f in other_faults]
+    tables = {f.name: fault_runs[f.name][0] if f in other_faults else
+              friction_runs[f.name][amounts[f.name].index(limits[f.name][0])] for f in faults}
     text = ";".join(f"{s.kind},{(s.stop - s.start) * period:.2f},{1e6 * s.first:.0f},{1e6 * s.last:.0f}" for s in parts)
     facts = {"made": "by simulation", "command": name, "plant": model.kind.name, "model": model.name,
              "parameters": format_design(model, faults), "runs": str(count), "faulty": str(faulty), "seed": str(seed),
              "command_hash": hashlib.sha256(text.encode()).hexdigest()[:16], "software": name_software()}
     if np.abs(load).max() > 0.0:
         facts["load"] = f"up to {np.abs(load).max():.4g} {signals.load.unit if signals.load else ''}"
-    known = tuple(BandFault(**vars(f), amounts=np.array(amounts.get(f.name, ()))) for f in faults)
-    bands = Bands(model.kind, tuple(parts), period, scale, known, stepped, tuple(ramped), facts,
+    band_faults = tuple(BandFault(**vars(f), amounts=np.array(amounts.get(f.name, ()))) for f in faults)
+    bands = Bands(model.kind, tuple(parts), period, scale, band_faults, step_bands, tuple(ramp_bands), facts,
                   _measure_sensitivities(tables, healthy, com, period, parts, signals.controlled.unit, scale))
-    shares = {f.name: [*_find_limit_shares(bands, com, f, faulted[f.name])] for f in known if f.name in faulted}
+    shares = {f.name: [*_find_limit_shares(bands, com, f, fault_runs[f.name])]
+              for f in band_faults if f.name in fault_runs}
     return replace(bands, faults=tuple(replace(f, middle_share=shares[f.name][0], most_share=shares[f.name][1])
-                                       if f.name in shares else f for f in known))
+                                       if f.name in shares else f for f in band_faults))
 
 
 def _list_amounts(fault: Fault, sound: float) -> list[float]:
@@ -173,8 +175,9 @@ def _list_amounts(fault: Fault, sound: float) -> list[float]:
     return [sound, *sorted({fault.acceptable, fault.maintenance, *(size for size in beside if size > 1.2 * sound)})]
 
 
-def _make_step_band(number: int, s: Section, period: float, sound: Floats, rubbing: Mapping[str, Sequence[Floats]],
-                    faulted: Mapping[str, Sequence[Floats]]) -> StepBand:
+def _make_step_band(number: int, s: Section, period: float, sound: Floats,
+                    friction_runs: Mapping[str, Sequence[Floats]], fault_runs: Mapping[str, Sequence[Floats]]
+                    ) -> StepBand:
     """The band of a step from healthy units, by fault units with rising friction, and units at MidBand and MaxBand.
 
     Shifts and spreads are taken at knots that are KNOT_CYCLES apart, with straight lines between them.
@@ -199,8 +202,8 @@ def _make_step_band(number: int, s: Section, period: float, sound: Floats, rubbi
 
     none = np.zeros(len(fine))
     frictions = {name: Friction(np.array([none, *map(shift, runs[1:])]), np.array([spread(x) for x in runs]))
-                 for name, runs in rubbing.items()}
-    middle, most = ({name: shift(runs[i]) for name, runs in faulted.items()} for i in (0, 1))
+                 for name, runs in friction_runs.items()}
+    middle, most = ({name: shift(runs[i]) for name, runs in fault_runs.items()} for i in (0, 1))
     return StepBand(number, fine.astype(float) * period, cut(sound).mean(axis=0), spread(sound), frictions, middle,
                     most)
 
@@ -212,21 +215,21 @@ def _make_ramp_band(number: int, s: Section, com: Floats, period: float, fault: 
     return RampBand(number, fault, _make_width(*errors), _make_width(*speeds), np.empty(0))
 
 
-def _make_friction_ramp(number: int, s: Section, com: Floats, period: float, fault: str, rubbing: Sequence[Floats],
+def _make_friction_ramp(number: int, s: Section, com: Floats, period: float, fault: str, runs: Sequence[Floats],
                         at: Sequence[int], easy: Sequence[Floats]) -> RampBand:
     """The band of a ramp from units with rising friction, those `at` have that of MidBand and MaxBand; `easy` ones have
     the former and a low dynamic friction.
     """
-    band = _make_ramp_band(number, s, com, period, fault, [rubbing[0], *(rubbing[i] for i in at)])
-    errors, speeds = zip(*(measure_ramp(x, com, s, period) for x in (*rubbing, *easy)), strict=True)
+    band = _make_ramp_band(number, s, com, period, fault, [runs[0], *(runs[i] for i in at)])
+    errors, speeds = zip(*(measure_ramp(x, com, s, period) for x in (*runs, *easy)), strict=True)
     half = np.array([np.median(compute_half_range(e)) for e in errors])
-    band = band._replace(half_range=np.maximum.accumulate(half[:len(rubbing)]))
+    band = band._replace(half_range=np.maximum.accumulate(half[:len(runs)]))
     if not easy:
         return band
     slip, easier = (float(np.median(find_lasting_peak(speeds[i]) / compute_half_range(errors[i])))
                     for i in (at[0], -1))
-    lost = 1 - half[-1] / half[at[0]]  # range ~ friction (1 - ease slip), through both
-    ease = lost / (easier - (1 - lost) * slip) if easier > slip and lost > 0.0 else 0.0
+    loss = 1 - half[-1] / half[at[0]]  # range ~ friction (1 - ease slip), through both
+    ease = loss / (easier - (1 - loss) * slip) if easier > slip and loss > 0.0 else 0.0
     return band._replace(slip=slip, ease=float(ease))
 
 
@@ -250,8 +253,8 @@ def _find_limit_shares(bands: Bands, com: Floats, fault: BandFault, units: Seque
     From the mean and scatter of their logarithms: the lowest of some hundred units estimates the lowest of all poorly.
     """
     def find_furthest(x: Floats, limit: str) -> float:
-        found, _, _ = find_excursions(com, x, bands.period, bands, list(bands.sections))
-        return max((float(find_lasting_peak(e.departure / getattr(e, limit))) for e in found
+        excursions, _, _ = find_excursions(com, x, bands.period, bands, list(bands.sections))
+        return max((float(find_lasting_peak(e.departure / getattr(e, limit))) for e in excursions
                     if e.fault == fault.name and e.section.kind == "step" and np.isfinite(e.departure).any()),
                    default=1.0)
 
@@ -263,17 +266,17 @@ def _find_limit_shares(bands: Bands, com: Floats, fault: BandFault, units: Seque
 def _measure_sensitivities(tables: Mapping[str, Floats], healthy: Floats, com: Floats, period: float,
                            parts: Sequence[Section], unit: str, scale: float) -> dict[str, dict[str, float]]:
     """Mean and scatter of healthy units, and what each fault at MidBand adds, by precursor."""
-    found = {word: compute_features(com, x, period, parts, unit, scale) for word, x in tables.items()}
-    whole = compute_features(com, healthy, period, parts, unit, scale)
+    fault_features = {word: compute_features(com, x, period, parts, unit, scale) for word, x in tables.items()}
+    healthy_features = compute_features(com, healthy, period, parts, unit, scale)
     return {name: {"healthy": _average_known(values), "noise": float(np.nanstd(values, ddof=1)),
                    **{word: _average_known(x[name]) - _average_known(values[:len(x[name])])
-                      for word, x in found.items()}} for name, values in whole.items()}
+                      for word, x in fault_features.items()}} for name, values in healthy_features.items()}
 
 
 def _average_known(values: Floats) -> float:
     """Mean over the units that show a precursor; NaN where most units do not show it."""
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if 2 * len(known) > len(values) else float("nan")
+    finite_values = values[~np.isnan(values)]
+    return float(finite_values.mean()) if 2 * len(finite_values) > len(values) else float("nan")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -305,16 +308,16 @@ def learn_bands(traces: Sequence[Trace], model: Model | None = None, names: Sequ
     base = choose_bands(com, np.zeros_like(com), period, model, progress, faults)
     rows = [_align_trace(base, trace, name) for trace, name in zip(traces, names, strict=True)]
     fleet = _Fleet(np.array([x for _, x in rows]), np.mean([c for c, _ in rows], axis=0), base)
-    found = replace(base, steps=tuple(fleet.correct_step(s) for s in base.steps),
+    bands = replace(base, steps=tuple(fleet.correct_step(s) for s in base.steps),
                     ramps=tuple(fleet.correct_ramp(r) for r in base.ramps), precursors=fleet.correct_precursors(),
                     provenance={**base.provenance, "made": f"from {len(traces)} healthy traces, faults simulated",
                                 "traces": ", ".join(names)})
-    doubtful = [name for (c, x), name in zip(rows, names, strict=True)
-                if any(level > Level.ACCEPTABLE for level in judge_position(c, x, period, base).levels.values())]
-    if doubtful:
-        return replace(found, provenance={
-            **found.provenance, "doubtful": f"beyond MidBand of simulated healthy units: {', '.join(doubtful)}"})
-    return found
+    doubtful_names = [name for (c, x), name in zip(rows, names, strict=True)
+                      if any(level > Level.ACCEPTABLE for level in judge_position(c, x, period, base).levels.values())]
+    if doubtful_names:
+        return replace(bands, provenance={
+            **bands.provenance, "doubtful": f"beyond MidBand of simulated healthy units: {', '.join(doubtful_names)}"})
+    return bands
 
 
 def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
@@ -328,8 +331,8 @@ def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
             f"one row per {1e3 * base.period:g} ms as the others, not {1e3 * period:g} ms")
     parts = find_sections(com, period, base.scale)
     require_same_command(base, parts, period, name)
-    own, usual = (next(s.start for s in p if s.kind in ("step", "ramp")) for p in (parts, base.sections))
-    at = np.clip(np.arange(base.sections[-1].stop) + own - usual, 0, len(xj) - 1)
+    start, base_start = (next(s.start for s in p if s.kind in ("step", "ramp")) for p in (parts, base.sections))
+    at = np.clip(np.arange(base.sections[-1].stop) + start - base_start, 0, len(xj) - 1)
     return com[at], fill_gaps(xj)[at]
 
 
@@ -343,9 +346,9 @@ class _Fleet:
         unsure = float(t.isf(norm.sf(BAND_NEAREST_LIMIT_SD), self.freedom + FLEET_PRIOR_TRACES)) / BAND_NEAREST_LIMIT_SD
         self.wider = unsure * float(np.sqrt(1 + 1 / len(x)))
 
-    def join_scatter(self, values: Floats, simulated: Floats) -> Floats:
+    def join_scatter(self, values: Floats, simulated_spread: Floats) -> Floats:
         """Standard deviation over the fleet, of (m, ..), shrunk to the simulated one and widened."""
-        squares = FLEET_PRIOR_TRACES * simulated**2 + self.freedom * values.var(axis=0, ddof=1)
+        squares = FLEET_PRIOR_TRACES * simulated_spread**2 + self.freedom * values.var(axis=0, ddof=1)
         out: Floats = self.wider * np.sqrt(squares / (FLEET_PRIOR_TRACES + self.freedom))
         return out
 
@@ -366,25 +369,25 @@ class _Fleet:
         return r._replace(position=self.correct_width(error, r.position), speed=self.correct_width(fast, r.speed),
                           half_range=half)
 
-    def correct_width(self, values: Floats, simulated: Width) -> Width:
+    def correct_width(self, values: Floats, width: Width) -> Width:
         """Width of a signal (m, rows); `healthy` is three standard deviations above the fleet's mean."""
         centre = float(np.nanmean(values))
         usual = find_lasting_peak(np.abs(values - centre))
-        spread = self.join_scatter(usual, np.array((simulated.healthy - float(usual.mean())) / 3).clip(0.0))
+        spread = self.join_scatter(usual, np.array((width.healthy - float(usual.mean())) / 3).clip(0.0))
         clear = float(usual.mean() + BAND_FAULT_CLEARANCE_SD * spread)
-        middle = simulated.middle if simulated.middle > clear else np.inf
-        return Width(centre, float(usual.mean() + 3 * spread), middle, max(middle, simulated.most))
+        middle = width.middle if width.middle > clear else np.inf
+        return Width(centre, float(usual.mean() + 3 * spread), middle, max(middle, width.most))
 
     def correct_precursors(self) -> dict[str, dict[str, float]]:
         """Mean and scatter of the fleet beside simulated sensitivities."""
         base = self.base
-        found = compute_features(self.com, self.x, base.period, list(base.sections), base.kind.signals.controlled.unit,
-                                 base.scale)
+        features = compute_features(self.com, self.x, base.period, list(base.sections),
+                                    base.kind.signals.controlled.unit, base.scale)
         out = {}
-        for name, known in base.precursors.items():
-            values = found[name][~np.isnan(found[name])]
-            noise = self.join_scatter(values, np.array(known["noise"])) if len(values) > 1 else known["noise"]
-            out[name] = {**known, "healthy": float(values.mean()) if len(values) else known["healthy"],
+        for name, numbers in base.precursors.items():
+            values = features[name][~np.isnan(features[name])]
+            noise = self.join_scatter(values, np.array(numbers["noise"])) if len(values) > 1 else numbers["noise"]
+            out[name] = {**numbers, "healthy": float(values.mean()) if len(values) else numbers["healthy"],
                          "noise": float(noise)}
         return out
 
@@ -417,8 +420,8 @@ def simulate_units(model: Model, com: Floats, load: Floats, changes: Mapping[str
         before = com[0] + lead_in if com[0] != 0.0 or first // NARROW % 2 else com[:0]
         noise = sample_sensor_noise(rng, model, len(before) + len(com))
         units = _sample_parameters(rng, model, tolerance, names, changes)[:members.stop - first]
-        asked, force = np.r_[before, com] - noise, np.r_[np.full(len(before), load[0]), load]
-        out[members] = (lanes.closed_loop(units, asked, force)[..., 0] + noise)[:, len(before):]
+        demand, force = np.r_[before, com] - noise, np.r_[np.full(len(before), load[0]), load]
+        out[members] = (lanes.closed_loop(units, demand, force)[..., 0] + noise)[:, len(before):]
 
     starts = range(0, count, NARROW)
     with ThreadPoolExecutor(count_threads()) as pool:

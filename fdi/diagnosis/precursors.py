@@ -25,13 +25,13 @@ def find_stays(beyond: Flags, lasting: int = BAND_EVENT_SAMPLES) -> list[tuple[i
     One or two samples are no event; a single sample back inside does not end one.
     """
     edges = np.flatnonzero(np.diff(beyond.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    found: list[tuple[int, int]] = []
+    stays: list[tuple[int, int]] = []
     for first, stop in edges.tolist():
-        if found and first - found[-1][1] <= lasting:
-            found[-1] = (found[-1][0], stop - 1)
+        if stays and first - stays[-1][1] <= lasting:
+            stays[-1] = (stays[-1][0], stop - 1)
         elif stop - first >= lasting:
-            found.append((first, stop - 1))
-    return found
+            stays.append((first, stop - 1))
+    return stays
 
 
 def find_lasting_peak(x: Floats, lasting: int = BAND_EVENT_SAMPLES) -> Floats:
@@ -113,29 +113,30 @@ class Precursor(NamedTuple):
         return self.noise if self.noise > 0.0 else math.nan
 
 
-def measure_precursors(source: Trace, known: Mapping[str, Mapping[str, float]] | None = None) -> dict[str, Precursor]:
+def measure_precursors(source: Trace, band_precursors: Mapping[str, Mapping[str, float]] | None = None
+                       ) -> dict[str, Precursor]:
     """The precursors of a trace by name; empty where too much of the position is missing.
 
     Args:
         source: the trace.
-        known: `Bands.precursors`: of healthy units and by fault.
+        band_precursors: `Bands.precursors`: of healthy units and by fault.
     """
     com, xj, _, period, _ = read_columns(source)
     if np.isnan(xj).mean() > POSITION_MISSING_SHARE:
         return {}
     unit, scale = source.declared.controlled.unit, source.scale
-    found = compute_features(com, fill_gaps(xj)[None], period, find_sections(com, period, scale), unit, scale)
-    return {name: _make_precursor(name, float(values[0]), unit, (known or {}).get(name, {}))
-            for name, values in found.items()}
+    features = compute_features(com, fill_gaps(xj)[None], period, find_sections(com, period, scale), unit, scale)
+    return {name: _make_precursor(name, float(values[0]), unit, (band_precursors or {}).get(name, {}))
+            for name, values in features.items()}
 
 
-def _make_precursor(name: str, value: float, unit: str, known: Mapping[str, float]) -> Precursor:
+def _make_precursor(name: str, value: float, unit: str, numbers: Mapping[str, float]) -> Precursor:
     kind, of_size = MEANINGS[find_kind(name)], _choose_size_unit(unit)[0]
     size = f", {name.rpartition('_')[2].removesuffix(of_size)} {of_size}" if find_kind(name) in OF_STEPS else ""
     si_unit = {"ms": "s", "um": unit, "mm/s": f"{unit}/s"}.get(kind.unit, kind.unit)
-    adds = {fault: by for fault, by in known.items() if fault not in ("healthy", "noise")}
+    adds = {fault: by for fault, by in numbers.items() if fault not in ("healthy", "noise")}
     return Precursor(value, si_unit, kind.words + size, format_precursor(value, name, si_unit),
-                     known.get("healthy", math.nan), known.get("noise", math.nan), adds)
+                     numbers.get("healthy", math.nan), numbers.get("noise", math.nan), adds)
 
 
 def format_precursor(value: float, name: str, si_unit: str = "m") -> str:
@@ -208,16 +209,16 @@ def measure_step(x: Floats, s: Section, period: float, settling_band: float = 0.
         horizon = rows
     peak = np.argmax(y[:, :horizon], axis=1)
     lowest = np.where(np.arange(horizon) > peak[:, None], y[:, :horizon], np.inf).min(axis=1)
-    outside = np.abs(y - 1) > settling_band
-    last = rows - 1 - np.argmax(outside[:, ::-1], axis=1)
-    needed = settled_for / period if rows > 2 * settled_for / period else 1
-    is_settled = rows - 1 - last >= needed
-    found = {"overshoot": 100 * (y[np.arange(len(y)), peak] - 1),
-             "undershoot": np.where(np.isfinite(lowest), 100 * (1 - lowest), np.nan),
-             "settling_time": np.where(is_settled, (last + 1) * period, np.nan)}
-    if (resting := round(at_rest_after / period)) < rows:
-        found["rest_error"] = np.sqrt(np.nanmean((x[:, resting:] - s.last)**2, axis=1))
-    return found
+    is_outside = np.abs(y - 1) > settling_band
+    last = rows - 1 - np.argmax(is_outside[:, ::-1], axis=1)
+    least_rows = settled_for / period if rows > 2 * settled_for / period else 1
+    is_settled = rows - 1 - last >= least_rows
+    response = {"overshoot": 100 * (y[np.arange(len(y)), peak] - 1),
+                "undershoot": np.where(np.isfinite(lowest), 100 * (1 - lowest), np.nan),
+                "settling_time": np.where(is_settled, (last + 1) * period, np.nan)}
+    if (rest_row := round(at_rest_after / period)) < rows:
+        response["rest_error"] = np.sqrt(np.nanmean((x[:, rest_row:] - s.last)**2, axis=1))
+    return response
 
 
 def _measure_ramp_response(com: Floats, x: Floats, period: float, s: Section) -> dict[str, Floats]:

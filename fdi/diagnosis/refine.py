@@ -153,16 +153,16 @@ def list_unknowns(model: Model, faults: Sequence[Fault] = FAULTS, fault_spread: 
     `fault_spread` is the prior standard deviation of the faults in tolerances: they may be of any size, and where no
     signal shows them, this is what is known.
     """
-    own = [u for fault in faults for u in _make_fault_unknowns(fault, model, fault_spread)]
+    fault_unknowns = [u for fault in faults for u in _make_fault_unknowns(fault, model, fault_spread)]
     suspects = [_make_suspect(s, model) for s in list_suspects(model, faults)]
-    taken = {f.name for f in (*own, *suspects)}
+    names = {f.name for f in (*fault_unknowns, *suspects)}
     ratio: list[Free] = []
-    if "jack.dynamic_friction" in taken and "jack.static_friction" not in taken:
+    if "jack.dynamic_friction" in names and "jack.static_friction" not in names:
         usual = math.log(get_positive(model, "jack.static_friction") / get_positive(model, "jack.dynamic_friction"))
         ratio = [LogFrictionRatio("jack.static_friction", usual, RATIO_SPREAD, 1.0, 0.0, usual + 1.0, 0.3)]
-        taken.add("jack.static_friction")
-    tolerances = (take_logarithm(f) for f in list_all_unknowns(model) if f.name not in taken)
-    return (*own, *suspects, *ratio, *tolerances)
+        names.add("jack.static_friction")
+    tolerances = (take_logarithm(f) for f in list_all_unknowns(model) if f.name not in names)
+    return (*fault_unknowns, *suspects, *ratio, *tolerances)
 
 
 def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free]:
@@ -187,22 +187,23 @@ def _make_fault_unknowns(fault: Fault, model: Model, spread: float) -> list[Free
                      min(by * low, by * high), max(by * low, by * high), 0.02) for name, by in factors.items()
                 ] + [u._replace(prior=2.0) for u in _list_shapes(fault, model)]
     least = max(low, SMALLEST_SHARE * fault.healthy)
-    same = find_quantity(fault.parameter, plant=model.plant).unit
+    unit = find_quantity(fault.parameter, plant=model.plant).unit
 
     def take_bounds(name: str) -> tuple[float, float]:  # of what follows, too, where it is of the same kind
-        by = 1.0 if find_quantity(name, plant=model.plant).unit == same else fault.follow[name]
+        by = 1.0 if find_quantity(name, plant=model.plant).unit == unit else fault.follow[name]
         return math.log(by * least), math.log(by * high)
 
     # The ram stops a few times in a test, and its static friction alone makes or misses some of these stops: its ratio
     # to the dynamic one is known. The spool stops in every cycle of stick-slip, and both of its frictions are free.
     if fault.parameter == "jack.static_friction" and list(fault.follow) == ["jack.dynamic_friction"]:
         dynamic, by = next(iter(fault.follow.items()))
-        led: list[Free] = [LogFrictionRatio(dynamic, math.log(by), RATIO_SPREAD, 1.0, -1.0, 0.0, 0.3)]
+        followers: list[Free] = [LogFrictionRatio(dynamic, math.log(by), RATIO_SPREAD, 1.0, -1.0, 0.0, 0.3)]
     else:
-        led = [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0)
-               for name in fault.follow]
+        followers = [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0)
+                     for name in fault.follow]
     name = fault.parameter
-    return [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0), *led]
+    return [LogFree(name, math.log(get_positive(model, name)), UNIT_TOLERANCE, spread, *take_bounds(name), 1.0),
+            *followers]
 
 
 def _list_shapes(fault: Fault, model: Model) -> list[Free]:
@@ -215,18 +216,18 @@ def _list_shapes(fault: Fault, model: Model) -> list[Free]:
 
 def list_suspects(model: Model, faults: Sequence[Fault]) -> list[Suspect]:
     """The suspects that this plant can have and that are not among the faults."""
-    own = {name for fault in faults for name in fault.parameters}
-    return [s for s in SUSPECTS if s.parameter not in own and (
+    fault_parameters = {name for fault in faults for name in fault.parameters}
+    return [s for s in SUSPECTS if s.parameter not in fault_parameters and (
         model.nominal.get(s.parameter, 0.0) > 0.0 if s.is_ratio else model.kind.offers(CATALOGUE[s.effect]))]
 
 
 def _make_suspect(s: Suspect, model: Model) -> Free:
-    own = next(u for u in list_effect_unknowns(model.find_effect(s.effect), model) if u.name == s.parameter)
+    unknown = next(u for u in list_effect_unknowns(model.find_effect(s.effect), model) if u.name == s.parameter)
     if s.is_ratio:
         usual = get_positive(model, s.parameter)
         return LogFree(s.parameter, math.log(usual), s.spread, 1.0, math.log(0.05 * usual), math.log(100.0 * usual),
                        0.02)
-    return own._replace(centre=model.values.get(s.parameter, own.centre), scale=s.spread, prior=1.0, step=0.02)
+    return unknown._replace(centre=model.values.get(s.parameter, unknown.centre), scale=s.spread, prior=1.0, step=0.02)
 
 
 def make_start(free: Sequence[Free], faults: Sequence[Fault], sizes: Sequence[float],
@@ -235,16 +236,16 @@ def make_start(free: Sequence[Free], faults: Sequence[Fault], sizes: Sequence[fl
 
     What follows a fault goes with it, but not beyond its value in `stays`.
     """
-    known = {f.name: f for f in free}
+    unknowns = {f.name: f for f in free}
     values: dict[str, float] = dict(offsets or {})
     for fault, size in zip(faults, sizes, strict=True):
-        own = known[fault.parameter]
-        size = fault.range[0] if isinstance(own, LogOpenFilter) and size < fault.range[0] else size
-        values[own.name] = place_value(own, size)
+        unknown = unknowns[fault.parameter]
+        size = fault.range[0] if isinstance(unknown, LogOpenFilter) and size < fault.range[0] else size
+        values[unknown.name] = place_value(unknown, size)
         for name, by in fault.follow.items():
-            if not isinstance(known[name], LogFrictionRatio):
-                value = max(size, math.exp(own.low)) / (1.0 / by) if isinstance(own, LogFree) else by * size
-                values[name] = place_value(known[name], min(value, (stays or {}).get(name, math.inf)))
+            if not isinstance(unknowns[name], LogFrictionRatio):
+                value = max(size, math.exp(unknown.low)) / (1.0 / by) if isinstance(unknown, LogFree) else by * size
+                values[name] = place_value(unknowns[name], min(value, (stays or {}).get(name, math.inf)))
     return np.array([(values.get(f.name, f.centre) - f.centre) / f.scale for f in free])
 
 
@@ -350,9 +351,9 @@ class CountedProblem(LogProblem):
 
     def find_flat(self, free: Sequence[Free], x: Floats) -> Floats:
         """Directions (p, k) at `x` (p,) that no signal shows, with what of the effects and of the faults goes along."""
-        faults = list_directions_of_faults(self.list_values(free, x))
-        others = [each for each in faults if next(iter(each)) in self.fault_parameters]
-        return find_flat_directions(self, free, x, (FLAPPER, *others), allowed=PRIORS_KNOW_MORE_MISFIT)
+        ways = list_directions_of_faults(self.list_values(free, x))
+        fault_ways = [way for way in ways if next(iter(way)) in self.fault_parameters]
+        return find_flat_directions(self, free, x, (FLAPPER, *fault_ways), allowed=PRIORS_KNOW_MORE_MISFIT)
 
     def predict_signals(self, names: Sequence[str], values: Floats, trace: Trace | None = None) -> Floats:
         self.counts.append(len(values))
@@ -364,9 +365,9 @@ def make_problem(model: Model, trace: Trace, floor: Mapping[str, float] | None =
     """The model with faults and suspects ready in it, and the run to compare it with; `floor` RMS noise by signal, SI.
     """
     level = {name: floor[name] if floor else model[trace.declared.find(name).noise] for name in trace.outputs}
-    own = [*(s.effect for s in list_suspects(model, faults) if not model.find_effect(s.effect).base),
-           *(name.partition(".")[0] for fault in faults for name in fault.parameters)]
-    ready = silence_readings(model).with_effects(own)
+    effects = [*(s.effect for s in list_suspects(model, faults) if not model.find_effect(s.effect).base),
+               *(name.partition(".")[0] for fault in faults for name in fault.parameters)]
+    ready = silence_readings(model).with_effects(effects)
     noise = tuple(noises.white_noise(level[name]) for name in trace.outputs)
     return CountedProblem(ready, trace, noise, workers=workers, faults=tuple(faults))
 
@@ -444,22 +445,23 @@ def _allow_observer_noise(problem: CountedProblem, free: Sequence[Free]) -> Coun
     names = [f.name for f in free]
     values = problem.convert_unknowns(free, make_healthy_start(problem, free)[None])
     for noise in guess_anchor_noise(trace, problem.model, floor):
-        shaken = replace(problem, trace=trace.with_columns({controlled: trace.controlled + noise}), _lanes={})
-        moved = compute_typical_rms((shaken.predict_outputs(names, values) - problem.predict_outputs(names, values))[0])
-        floor |= {s: math.hypot(floor[s], float(by)) for s, by in zip(trace.outputs, moved, strict=True)
+        noisy_problem = replace(problem, trace=trace.with_columns({controlled: trace.controlled + noise}), _lanes={})
+        changes = compute_typical_rms((noisy_problem.predict_outputs(names, values)
+                                       - problem.predict_outputs(names, values))[0])
+        floor |= {s: math.hypot(floor[s], float(by)) for s, by in zip(trace.outputs, changes, strict=True)
                   if s != controlled}
     return replace(problem, noise=tuple(noises.white_noise(floor[s]) for s in trace.outputs), _lanes={})
 
 
-def _leave_out_stops(problem: CountedProblem, found: Fit) -> CountedProblem:
+def _leave_out_stops(problem: CountedProblem, fit: Fit) -> CountedProblem:
     """The problem without the rows that hang on a stop of the plant: what they say of its parameters is chance."""
-    whole, floor = replay_fit(problem, found, found.x), list_floors(problem)
+    whole, floor = replay_fit(problem, fit, fit.x), list_floors(problem)
     slight = {name: math.sqrt(RESIDUAL_IS_NOISE**2 - 1.0) * level for name, level in floor.items()}
     rows = find_undecided_rows(problem, whole, slight)  # less than the noise each, they add to the residual as well
     large = find_unpredictable_rows(problem, whole, floor)
-    tried = (rows | large, rows, large if large.any() else find_undecided_rows(problem, whole, floor))
-    cut = (leave_out_rows(problem.trace, rows) for rows in tried)
-    return replace(problem, trace=next((run for run in cut if run is not problem.trace), problem.trace), _lanes={})
+    candidates = (rows | large, rows, large if large.any() else find_undecided_rows(problem, whole, floor))
+    runs = (leave_out_rows(problem.trace, rows) for rows in candidates)
+    return replace(problem, trace=next((run for run in runs if run is not problem.trace), problem.trace), _lanes={})
 
 
 def list_floors(problem: Problem) -> dict[str, float]:
@@ -483,23 +485,23 @@ def _fit_finely(problem: CountedProblem, first: Fit) -> Fit:
     return last
 
 
-def _restart_fit(problem: CountedProblem, found: Fit, parts: Sequence[float], rounds: int = 8) -> Fit:
+def _restart_fit(problem: CountedProblem, fit: Fit, parts: Sequence[float], rounds: int = 8) -> Fit:
     """The best of a fit and some that begin elsewhere on the line to a unit with these faults and no other deviation.
 
     `parts` of that line lie between the fit, 0, and the other unit, 1. Stops of the ram make ridges: tolerances that
     lie behind one of them are found from the other side, or never.
     """
-    free, home, alone = found.free, place_home(problem, found), problem.alone
+    free, home, alone = fit.free, place_home(problem, fit), problem.alone
 
     def fit_from(part: float) -> Fit:
-        begun = descend(alone, start_fit(free, found.x + part * (home - found.x)), NOISE_SCHEDULE)
-        flat = alone.find_flat(free, begun.x)
-        return descend_valley(replace(alone, steps=FINE_STEPS, _lanes={}), begun, rounds, flat, problem.stage)
+        coarse_fit = descend(alone, start_fit(free, fit.x + part * (home - fit.x)), NOISE_SCHEDULE)
+        flat = alone.find_flat(free, coarse_fit.x)
+        return descend_valley(replace(alone, steps=FINE_STEPS, _lanes={}), coarse_fit, rounds, flat, problem.stage)
 
-    return min(found, *map_in_threads(fit_from, parts, problem.workers), key=lambda f: f.cost)
+    return min(fit, *map_in_threads(fit_from, parts, problem.workers), key=lambda f: f.cost)
 
 
-def _retry_without(problem: CountedProblem, found: Fit, most: int = 2) -> Fit:
+def _retry_without(problem: CountedProblem, fit: Fit, most: int = 2) -> Fit:
     """The best of a fit and some that begin without one of the causes that it blames: one may stand for another.
 
     Without a fault they begin at the same unit, and where the fault looks like parameters of the plant, with these in
@@ -510,93 +512,93 @@ def _retry_without(problem: CountedProblem, found: Fit, most: int = 2) -> Fit:
     alone = problem.alone
 
     def fit_from(starts: Floats) -> Fit:
-        best = starts[int(np.argmin(problem.compute_costs(found.free, starts)))]
-        begun = descend(alone, start_fit(found.free, best), NOISE_SCHEDULE[1:])
-        return descend_valley(fine, begun, 8, alone.find_flat(found.free, begun.x))
+        best = starts[int(np.argmin(problem.compute_costs(fit.free, starts)))]
+        coarse_fit = descend(alone, start_fit(fit.free, best), NOISE_SCHEDULE[1:])
+        return descend_valley(fine, coarse_fit, 8, alone.find_flat(fit.free, coarse_fit.x))
 
     suspects = [s.parameter for s in list_suspects(problem.model, problem.faults)]
-    names = [f.name for f in found.free]
+    names = [f.name for f in fit.free]
     for _ in range(most):
-        alike = find_alike(found, [fault.parameter for fault in problem.faults], suspects)
-        ways = [*list_directions_of_faults(problem.list_values(found.free, found.x)), *alike]
-        sizes = {fault: found.values[fault.parameter] for fault in problem.faults if _blames(fault, found)}
-        tried = []
-        for name, x in ((fault.parameter, set_sizes(found, fault, fault.healthy)) for fault in sizes):
-            own = [way for way in ways if next(iter(way)) == name and way[name]]
-            tried.append(np.array([x, *(slide_along(found, way, name, x[names.index(name)]) for way in own)]))
+        alike = find_alike(fit, [fault.parameter for fault in problem.faults], suspects)
+        ways = [*list_directions_of_faults(problem.list_values(fit.free, fit.x)), *alike]
+        sizes = {fault: fit.values[fault.parameter] for fault in problem.faults if _blames(fault, fit)}
+        start_sets = []
+        for name, x in ((fault.parameter, set_sizes(fit, fault, fault.healthy)) for fault in sizes):
+            fault_ways = [way for way in ways if next(iter(way)) == name and way[name]]
+            start_sets.append(np.array([x, *(slide_along(fit, way, name, x[names.index(name)]) for way in fault_ways)]))
         far = 0.2  # of what is typical
-        moved = [name for name, x in zip(names, found.x, strict=True) if name in suspects and abs(x) > far]
+        active_suspects = [name for name, x in zip(names, fit.x, strict=True) if name in suspects and abs(x) > far]
         for fault, way in product(problem.faults, alike):
             name, suspect = way
-            if name == fault.parameter and suspect in moved:
+            if name == fault.parameter and suspect in active_suspects:
                 k = names.index(name)
-                sizes[fault] = found.free[k].value(float(slide_along(found, way, suspect, 0.0)[k]))
-        if moved:
-            tried += [_list_alone(problem, found, fault, size) for fault, size in sizes.items()]
-        best = min(map_in_threads(fit_from, tried, problem.workers), key=lambda f: f.cost, default=found)
-        if best.cost >= found.cost:
+                sizes[fault] = fit.free[k].value(float(slide_along(fit, way, suspect, 0.0)[k]))
+        if active_suspects:
+            start_sets += [_list_alone(problem, fit, fault, size) for fault, size in sizes.items()]
+        best = min(map_in_threads(fit_from, start_sets, problem.workers), key=lambda f: f.cost, default=fit)
+        if best.cost >= fit.cost:
             break
-        found = best
-    return found
+        fit = best
+    return fit
 
 
-def find_alike(found: Fit, faults: Sequence[str], suspects: Sequence[str]) -> list[Mapping[str, float]]:
+def find_alike(fit: Fit, faults: Sequence[str], suspects: Sequence[str]) -> list[Mapping[str, float]]:
     """Directions along which a suspect looks like a fault, both by parameter; the fault is named first.
 
     A blocked nozzle shifts the null as a bias does; only where the flapper meets its stops do they differ, and a fit
     may end anywhere between the two.
     """
-    names, slopes = [f.name for f in found.free], found.jacobian.reshape(len(found.free), -1)
-    products = (slopes * compute_weights(found.white).reshape(-1)) @ slopes.T
-    lengths, scales = np.sqrt(np.diag(products)), [f.scale for f in found.free]
+    names, slopes = [f.name for f in fit.free], fit.jacobian.reshape(len(fit.free), -1)
+    products = (slopes * compute_weights(fit.white).reshape(-1)) @ slopes.T
+    lengths, scales = np.sqrt(np.diag(products)), [f.scale for f in fit.free]
     pairs = [(names.index(fault), names.index(suspect)) for fault, suspect in product(faults, suspects)]
     return [{names[k]: scales[k], names[j]: -scales[j] * products[k, k] / products[j, k]} for k, j in pairs
             if abs(products[j, k]) > SUSPECT_COSINE * lengths[j] * lengths[k]]
 
 
-def slide_along(found: Fit, way: Mapping[str, float], name: str, to: float) -> Floats:
+def slide_along(fit: Fit, way: Mapping[str, float], name: str, to: float) -> Floats:
     """Scaled unknowns (p,) of a fit moved along a direction, within the bounds, until the unknown `name` is at `to`."""
-    k = [f.name for f in found.free].index(name)
-    part = (to - found.x[k]) * found.free[k].scale / way[name]
-    shift = np.array([get_power(way, f) * part / f.scale for f in found.free])
-    return np.clip(np.where(np.arange(len(shift)) == k, to, found.x + shift), *scaled_bounds(found.free))
+    k = [f.name for f in fit.free].index(name)
+    part = (to - fit.x[k]) * fit.free[k].scale / way[name]
+    shift = np.array([get_power(way, f) * part / f.scale for f in fit.free])
+    return np.clip(np.where(np.arange(len(shift)) == k, to, fit.x + shift), *scaled_bounds(fit.free))
 
 
-def _list_alone(problem: CountedProblem, found: Fit, fault: Fault, size: float) -> Floats:
+def _list_alone(problem: CountedProblem, fit: Fit, fault: Fault, size: float) -> Floats:
     """Starts (m, p) at units without other deviations than this fault, of about that size, SI, or all the faults."""
-    every = [f.name in problem.fault_parameters for f in found.free]
-    own = [f.name in fault.parameters for f in found.free]
-    healthy = make_start(found.free, problem.faults, [each.healthy for each in problem.faults])
-    homes = [replace(found, x=np.where(kept, found.x, healthy)) for kept in (every, own)]
+    is_fault = [f.name in problem.fault_parameters for f in fit.free]
+    is_own = [f.name in fault.parameters for f in fit.free]
+    healthy = make_start(fit.free, problem.faults, [each.healthy for each in problem.faults])
+    homes = [replace(fit, x=np.where(mask, fit.x, healthy)) for mask in (is_fault, is_own)]
     return np.array([set_sizes(home, fault, fault.healthy + part * (size - fault.healthy))
                      for home in homes for part in np.linspace(0.6, 1.6, 16)])
 
 
-def polish_fit(problem: CountedProblem, found: Fit) -> Fit:
+def polish_fit(problem: CountedProblem, fit: Fit) -> Fit:
     """The fit with the plant's own steps: coarser ones bias sizes that they resemble, such as a lag.
 
     Slopes are those of coarser steps, at a fifth of the time.
     """
     exact, coarse = (replace(problem, steps=steps, _lanes={}) for steps in (problem.model.steps, FINE_STEPS))
-    flat = problem.find_flat(found.free, found.x)
+    flat = problem.find_flat(fit.free, fit.x)
     for factor, rounds in POLISH:
-        begun = replace(found, covariance=guess_covariance(found.free))
-        found = descend_valley(scale_noise(exact, factor), begun, rounds, flat, problem.stage,
-                               scale_noise(coarse, factor))
-    return replace(found, covariance=estimate_smooth_covariance(coarse, found, flat))
+        start = replace(fit, covariance=guess_covariance(fit.free))
+        fit = descend_valley(scale_noise(exact, factor), start, rounds, flat, problem.stage,
+                             scale_noise(coarse, factor))
+    return replace(fit, covariance=estimate_smooth_covariance(coarse, fit, flat))
 
 
-def set_sizes(found: Fit, fault: Fault, size: float) -> Floats:
+def set_sizes(fit: Fit, fault: Fault, size: float) -> Floats:
     """Scaled unknowns (p,) of a fit with another size of one fault, within the bounds."""
-    x, changes = found.x.copy(), fault.list_changes(size)
-    for k, f in enumerate(found.free):
+    x, changes = fit.x.copy(), fault.list_changes(size)
+    for k, f in enumerate(fit.free):
         if f.name in changes and not isinstance(f, LogFrictionRatio):
             x[k] = (min(max(place_value(f, changes[f.name]), f.low), f.high) - f.centre) / f.scale
     return x
 
 
-def _blames(fault: Fault, found: Fit) -> bool:
-    return fault.measure_departure(found.values[fault.parameter]) > FAULT_BLAMED_SHARE * fault.limits[1]
+def _blames(fault: Fault, fit: Fit) -> bool:
+    return fault.measure_departure(fit.values[fault.parameter]) > FAULT_BLAMED_SHARE * fault.limits[1]
 
 
 def _blames_a_fault(problem: CountedProblem, free: Sequence[Free], x: Floats) -> bool:
@@ -611,18 +613,18 @@ def make_healthy_start(problem: CountedProblem, free: Sequence[Free]) -> Floats:
 
 def place_home(problem: CountedProblem, fit: Fit) -> Floats:
     """Scaled unknowns, (p,), of a unit with a fit's faults and effects and no other deviation."""
-    kept = [f.name in problem.fault_parameters or not np.isfinite(f.prior) for f in fit.free]
-    return np.where(kept, fit.x, make_healthy_start(problem, fit.free))
+    is_kept = [f.name in problem.fault_parameters or not np.isfinite(f.prior) for f in fit.free]
+    return np.where(is_kept, fit.x, make_healthy_start(problem, fit.free))
 
 
-def is_noise_left(problem: Problem, found: Fit) -> bool:
+def is_noise_left(problem: Problem, fit: Fit) -> bool:
     """Whether the fit leaves only noise."""
-    return max(measure_ratios(problem, found)) <= RESIDUAL_IS_NOISE
+    return max(measure_ratios(problem, fit)) <= RESIDUAL_IS_NOISE
 
 
-def measure_ratios(problem: Problem, found: Fit) -> list[float]:
+def measure_ratios(problem: Problem, fit: Fit) -> list[float]:
     """RMS residual over noise, signal by signal."""
-    return [float(np.sqrt(np.nanmean(r**2))) / n.level for r, n in zip(found.residuals, problem.noise, strict=True)]
+    return [float(np.sqrt(np.nanmean(r**2))) / n.level for r, n in zip(fit.residuals, problem.noise, strict=True)]
 
 
 def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[Sizes]) -> Floats:
@@ -631,22 +633,22 @@ def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence
     known_offsets, faults = estimate_offsets(problem), problem.faults
     usual = {name: problem.model[name] for fault in faults for name in fault.follow}
 
-    def try_starts(tried: Sequence[Sizes], way: Way) -> tuple[float, Sizes, Floats]:
+    def try_starts(candidates: Sequence[Sizes], way: Way) -> tuple[float, Sizes, Floats]:
         shape, stays, offsets = way
-        x = np.array([make_start(free, faults, s, {**offsets, **shape}, stays) for s in tried])
+        x = np.array([make_start(free, faults, s, {**offsets, **shape}, stays) for s in candidates])
         costs = compute_misfit(loud.compute_white_residuals(free, x))
         k = int(np.argmin(costs))
-        return float(costs[k]), tried[k], x[k]
+        return float(costs[k]), candidates[k], x[k]
 
     def search(way: Way) -> tuple[float, Floats]:
         cost, best, x = try_starts(starts, way)
         # of the two faults that are furthest gone
-        moved = sorted(sorted(range(len(faults)), key=lambda i: -compute_severity(faults[i], best[i]))[:2])
+        indices = sorted(sorted(range(len(faults)), key=lambda i: -compute_severity(faults[i], best[i]))[:2])
         for part, factor in ((0.2, 1.2), (0.08, 1.08), (0.04, 1.03)):  # of MidBand, and of sizes by their logarithm
             around = []
-            for steps in product(range(-2, 3), repeat=len(moved)):
+            for steps in product(range(-2, 3), repeat=len(indices)):
                 sizes = list(best)
-                for i, step in zip(moved, steps, strict=True):
+                for i, step in zip(indices, steps, strict=True):
                     sizes[i] = _step_size(faults[i], best[i], step, part, factor)
                 around.append(tuple(sizes))
             cost, best, x = try_starts(around, way)
@@ -661,13 +663,13 @@ def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence
 
 def _list_shape_starts(problem: CountedProblem) -> list[dict[str, float]]:
     """Values to begin at of what faults' effects have beside their size: one that has none is {}."""
-    found: list[dict[str, float]] = [{}]
+    shape_starts: list[dict[str, float]] = [{}]
     for fault in problem.faults:
         names = [u.name for u in _list_shapes(fault, problem.model)]
         starts = problem.model.find_effect(fault.parameter.partition(".")[0]).starts if names else ()
         shapes = {tuple(start[name] for name in names): None for start in starts} or {(): None}
-        found = [{**each, **dict(zip(names, shape, strict=True))} for each in found for shape in shapes]
-    return found
+        shape_starts = [{**each, **dict(zip(names, shape, strict=True))} for each in shape_starts for shape in shapes]
+    return shape_starts
 
 
 def _step_size(fault: Fault, size: float, steps: int, part: float, factor: float) -> float:
@@ -693,11 +695,11 @@ def estimate_offsets(problem: Problem) -> dict[str, float]:
         way += float(x[-1] - x[0])
     speed = way / (len(trace) * p["controller.period"])
     per_speed = p["jack.area"] / p["valve.flow_gain"] * p["feedback_spring.stiffness"] / p["torque_motor.gain"]
-    found = {"null_bias.current": per_speed * speed - float(trace.drive.mean())}
+    offsets = {"null_bias.current": per_speed * speed - float(trace.drive.mean())}
     if P12 in trace.outputs:
         pressure = trace.mask_unusable(P12)
-        found["constant_load.force"] = p["jack.area"] * float(np.nanmean(pressure)) - float(trace.load.mean())
-    return found
+        offsets["constant_load.force"] = p["jack.area"] * float(np.nanmean(pressure)) - float(trace.load.mean())
+    return offsets
 
 
 def find_hopeless_ratio(trace: Trace, name: str) -> float:
@@ -706,11 +708,11 @@ def find_hopeless_ratio(trace: Trace, name: str) -> float:
     return RESIDUAL_HOPELESS_VALVE if signal.unit == controlled.unit and signal != controlled else RESIDUAL_HOPELESS
 
 
-def learn_left_noise(problem: CountedProblem, found: Fit) -> CountedProblem:
+def learn_left_noise(problem: CountedProblem, fit: Fit) -> CountedProblem:
     """The problem with the noise that a fit leaves, signal by signal, where only noise is left."""
     return replace(problem, noise=tuple(
         noises.fit_noise(r) if float(np.sqrt(np.nanmean(r**2))) <= RESIDUAL_IS_NOISE * old.level else old
-        for old, r in zip(problem.noise, found.residuals, strict=True)), _lanes={})
+        for old, r in zip(problem.noise, fit.residuals, strict=True)), _lanes={})
 
 
 def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -> Refinement:
@@ -724,14 +726,14 @@ def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -
     sizes = {fault.name: estimate_parameter(last, fault.parameter, fault.interval_factor,
                                             _find_narrowest(last.free[k], float(last.x[k]), fault))
              for fault, k in zip(problem.faults, places, strict=True)}
-    found = Refinement(problem.faults, sizes, correlations,
-                       {s.parameter: estimate_parameter(last, s.parameter)
-                        for s in list_suspects(problem.model, problem.faults)}, last, errors, floor,
-                       sum(problem.counts))
+    refinement = Refinement(problem.faults, sizes, correlations,
+                            {s.parameter: estimate_parameter(last, s.parameter)
+                             for s in list_suspects(problem.model, problem.faults)}, last, errors, floor,
+                            sum(problem.counts))
     if whole is None or whole is problem.trace:
-        return found
-    judged = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
-    return replace(found, errors=judged.errors, everywhere=judged.typical_ratio(found.floor))
+        return refinement
+    judgement = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
+    return replace(refinement, errors=judgement.errors, everywhere=judgement.typical_ratio(refinement.floor))
 
 
 def _find_narrowest(f: Free, x: float, fault: Fault) -> float:
@@ -745,15 +747,15 @@ def _find_narrowest(f: Free, x: float, fault: Fault) -> float:
     return NARROWEST_SHARE * (middle - healthy) / max(slope, 1e-3 * (middle - healthy))
 
 
-def estimate_parameter(found: Fit, name: str, factor: float = 1.0, least: float = 0.0) -> Estimate:
+def estimate_parameter(fit: Fit, name: str, factor: float = 1.0, least: float = 0.0) -> Estimate:
     """A parameter with its 95 % interval, `factor` times as wide as the fit's covariance says, within its bounds.
 
     `least`: of the scaled unknown, half the narrowest interval.
     """
-    i = [f.name for f in found.free].index(name)
-    half = max(factor * INTERVAL_95_SD * float(np.sqrt(found.covariance[i, i])), least)
-    low, high = sorted(found.free[i].value(float(found.x[i]) + way * half) for way in (-1.0, 1.0))
-    return Estimate(found.free[i].value(float(found.x[i])), low, high)
+    i = [f.name for f in fit.free].index(name)
+    half = max(factor * INTERVAL_95_SD * float(np.sqrt(fit.covariance[i, i])), least)
+    low, high = sorted(fit.free[i].value(float(fit.x[i]) + way * half) for way in (-1.0, 1.0))
+    return Estimate(fit.free[i].value(float(fit.x[i])), low, high)
 
 
 def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Mapping[str, float],
@@ -776,16 +778,16 @@ def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Ma
     for name in (e.name for e in list_searched_effects(model.plant) if e.fitted and e.port not in UNREPLAYED):
         ensure_starts(name, trace.command, trace.load, model.plant)  # where the file of a user's plant gives none
     search = JointSearch(problem, list_other_effects(model, faults), progress)
-    found = search.find_explanations(alone.fit)
-    return average_explanations([_explain(h, search.problem, whole) for h in found], marks)
+    hypotheses = search.find_explanations(alone.fit)
+    return average_explanations([_explain(h, search.problem, whole) for h in hypotheses], marks)
 
 
 def list_other_effects(model: Model, faults: Sequence[Fault] = FAULTS) -> list[str]:
     """The effects that are searched: all that a replay shows, but for those that every fit of the faults has."""
-    own = {name for fault in faults for name in fault.parameters}
+    fault_parameters = {name for fault in faults for name in fault.parameters}
     always = {*(s.effect for s in SUSPECTS), *model.effects}
     return [e.name for e in list_searched_effects(model.plant)
-            if e.name not in always and e.port not in UNREPLAYED and e.starts and not own & set(e.fitted)]
+            if e.name not in always and e.port not in UNREPLAYED and e.starts and not fault_parameters & set(e.fitted)]
 
 
 def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]
@@ -794,8 +796,8 @@ def _read_marks(model: Model, trace: Trace, floor: Mapping[str, float]
     marks, floor = find_marks(model, [trace]), dict(floor)
     if marks.step and "quantisation" not in model.effects:
         controlled = trace.declared.controlled
-        rounded = float(np.hypot(model.values.get(controlled.noise, 0.0), marks.rounding))
-        floor[controlled.name] = max(floor[controlled.name], rounded)
+        rounding_floor = float(np.hypot(model.values.get(controlled.noise, 0.0), marks.rounding))
+        floor[controlled.name] = max(floor[controlled.name], rounding_floor)
     return {p.effect: {name: Value(*interval, find_quantity(name, plant=model.plant).unit)
                        for name, interval in p.parameters.items()} for p in marks.prints}, floor
 
@@ -824,23 +826,23 @@ class JointSearch:
         """
         faults_alone = Hypothesis((), replace(alone, free=self.list_unknowns()), {})
         parents = self.continue_fits([faults_alone], ((1.0, 2),))
-        found = self.deepen(parents)
+        hypotheses = self.deepen(parents)
         for count in range(1, most_effects + 1):
             self.progress(f"looking for effect {count} beside the faults", 0.3 * count - 0.1)
-            is_enough = is_noise_left(self.problem, found[0].fit)
-            tried = [each for parent in parents for each in self.add_effects(parent, count, is_enough)]
-            if not tried:
+            is_enough = is_noise_left(self.problem, hypotheses[0].fit)
+            children = [each for parent in parents for each in self.add_effects(parent, count, is_enough)]
+            if not children:
                 break
-            parents = sort_by_cost(tried)[:4]
+            parents = sort_by_cost(children)[:4]
             self.progress(f"fitting {', '.join(map(_describe, parents))} further", 0.3 * count)
             deep = sort_by_cost(self.deepen(parents))
-            if count > 1 and not takes_fair_share(self.problem, sort_by_cost(found)[0], deep[0]):
+            if count > 1 and not takes_fair_share(self.problem, sort_by_cost(hypotheses)[0], deep[0]):
                 break
-            found += deep
+            hypotheses += deep
             if is_noise_left(self.problem, deep[0].fit):
                 break
             parents = self.continue_fits(deep[:2], ((1.0, 2),))
-        return self.finish(found)
+        return self.finish(hypotheses)
 
     def list_unknowns(self) -> tuple[Free, ...]:
         """What the fits of the faults alone change."""
@@ -851,10 +853,10 @@ class JointSearch:
         """The hypotheses after further rounds of their fits: see `descend`."""
         return self.map_alone(lambda h: replace(h, fit=self.descend(h.fit, schedule)), hypotheses)
 
-    def deepen(self, found: Sequence[Hypothesis], rounds: int = 8) -> list[Hypothesis]:
+    def deepen(self, hypotheses: Sequence[Hypothesis], rounds: int = 8) -> list[Hypothesis]:
         """The fits taken further with finer steps; while the best leaves more than noise, they also begin elsewhere."""
         fine = self._refine_steps()
-        deep = fine.continue_fits(found, ((1.0, rounds),))
+        deep = fine.continue_fits(hypotheses, ((1.0, rounds),))
         if is_noise_left(self.problem, sort_by_cost(deep)[0].fit):
             return deep
         return self.map_alone(lambda h: fine.restart(h, (1.0,)) if fine.is_near(h) else h, deep)
@@ -880,8 +882,8 @@ class JointSearch:
             return []
         self.progress(f"fitting {', '.join(dict.fromkeys(p.effect for p in worth))}", 0.3 * count - 0.05)
         # at the scan's linear forecast, with the noise first taken for larger
-        begun = [Hypothesis((*parent.effects, p.effect), start_fit(p.free, p.x), {}) for p in worth]
-        promising = sort_by_cost(self.continue_fits(begun, (NOISE_SCHEDULE[1], (1.0, 3))))[:4]
+        starts = [Hypothesis((*parent.effects, p.effect), start_fit(p.free, p.x), {}) for p in worth]
+        promising = sort_by_cost(self.continue_fits(starts, (NOISE_SCHEDULE[1], (1.0, 3))))[:4]
         return drop_duplicates(self.continue_fits(promising, ((3.0, 3), (1.0, 6))))
 
     def scan(self, fit: Fit, effects: Sequence[str], most: float) -> list[Prospect]:
@@ -906,35 +908,35 @@ class JointSearch:
         return linearise_across(self.problem, replay_fit(self.problem, start_fit(free, x), x),
                                 self.problem.alone.find_flat(free, x))
 
-    def finish(self, found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    def finish(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
         """The likely ones to the end with finer steps, under the noise that the best one leaves."""
-        ranked = sorted(found, key=_compute_charged_cost)
+        ranking = sorted(hypotheses, key=_compute_charged_cost)
         near = 60.0 * GAIN_TIE  # such fits are not done: beginning again has gained a few hundred
-        close = [h for h in ranked if h.cost < ranked[0].cost + near][:4]
-        self.progress(f"last fits, {', '.join(map(_describe, close))}", 0.75)
-        self.problem = learn_left_noise(self._refine_steps().problem, ranked[0].fit)
-        done = self.continue_fits(close, ((1.0, 8),))
-        best = sort_by_cost(done)[0]
+        rivals = [h for h in ranking if h.cost < ranking[0].cost + near][:4]
+        self.progress(f"last fits, {', '.join(map(_describe, rivals))}", 0.75)
+        self.problem = learn_left_noise(self._refine_steps().problem, ranking[0].fit)
+        last_fits = self.continue_fits(rivals, ((1.0, 8),))
+        best = sort_by_cost(last_fits)[0]
         if len(best.effects) > 1:
             self.progress(f"last fits without one of {_describe(best)}", 0.85)
-            done += self.map_alone(partial(self._leave_out, best), best.effects)
-        return self._search_other_valleys(self._begin_again(drop_duplicates(done)))
+            last_fits += self.map_alone(partial(self._leave_out, best), best.effects)
+        return self._search_other_valleys(self._begin_again(drop_duplicates(last_fits)))
 
-    def _search_other_valleys(self, done: Sequence[Hypothesis], most: int = 2) -> list[Hypothesis]:
+    def _search_other_valleys(self, hypotheses: Sequence[Hypothesis], most: int = 2) -> list[Hypothesis]:
         """The fits, the likeliest of them also from searches by populations while none leaves only noise.
 
         Where static friction of the ram ends far off, no start on the way to a healthy unit leads out of that valley:
         the frictions have to move together (`fdi.estimation.fit`).
         """
-        done = list(done)
-        ranked = sorted(done, key=_compute_charged_cost)
+        hypotheses = list(hypotheses)
+        ranking = sorted(hypotheses, key=_compute_charged_cost)
         worst = 1.5  # times the least cost, above which no valley is looked for
-        for h in [one for one in ranked if one.cost < worst * ranked[0].cost][:most]:
-            if any(is_noise_left(self.problem, each.fit) for each in done):
+        for h in [one for one in ranking if one.cost < worst * ranking[0].cost][:most]:
+            if any(is_noise_left(self.problem, each.fit) for each in hypotheses):
                 break
             self.progress(f"search of other valleys, {_describe(h)}", 0.95)
-            done[done.index(h)] = _keep_best(h, self.map_alone(partial(self.search_widely, h.fit), (0, 1)))
-        return done
+            hypotheses[hypotheses.index(h)] = _keep_best(h, self.map_alone(partial(self.search_widely, h.fit), (0, 1)))
+        return hypotheses
 
     def search_widely(self, fit: Fit, seed: int, steps: int = 10) -> Fit:
         """The fit at which a population ends that begins at a unit with these faults and effects, otherwise healthy.
@@ -948,24 +950,24 @@ class JointSearch:
         end = search_widely(replace(alone, steps=steps), alone, home, widths, POPULATION_STAGES, seed)
         return self.descend(end, ((1.0, 8),))
 
-    def _begin_again(self, done: Sequence[Hypothesis], most: int = 2) -> list[Hypothesis]:
+    def _begin_again(self, hypotheses: Sequence[Hypothesis], most: int = 2) -> list[Hypothesis]:
         """The fits, the best of them also from other places; again as long as that changes which is best."""
-        done, tried = list(done), set[tuple[str, ...]]()
-        while len(tried) < most:
-            best = min(done, key=_compute_charged_cost)
-            if best.effects in tried or not self.is_near(best):
+        hypotheses, restarts = list(hypotheses), set[tuple[str, ...]]()
+        while len(restarts) < most:
+            best = min(hypotheses, key=_compute_charged_cost)
+            if best.effects in restarts or not self.is_near(best):
                 break
-            tried.add(best.effects)
-            self.progress(f"another start, {_describe(best)}", 0.85 + 0.05 * len(tried))
-            done[done.index(best)] = self.restart(best, (1.0, 0.5))
-        return done
+            restarts.add(best.effects)
+            self.progress(f"another start, {_describe(best)}", 0.85 + 0.05 * len(restarts))
+            hypotheses[hypotheses.index(best)] = self.restart(best, (1.0, 0.5))
+        return hypotheses
 
     def _leave_out(self, h: Hypothesis, effect: str) -> Hypothesis:
         """The fit without one of its effects: the search may have needed it only to leave a local minimum."""
-        dropped = set(self.problem.model.find_effect(effect).fitted)
-        kept = [k for k, f in enumerate(h.fit.free) if f.name not in dropped]
-        begun = start_fit([h.fit.free[k] for k in kept], h.fit.x[kept])
-        return Hypothesis(tuple(e for e in h.effects if e != effect), self.descend(begun, ((3.0, 4), (1.0, 8))), {})
+        names = set(self.problem.model.find_effect(effect).fitted)
+        places = [k for k, f in enumerate(h.fit.free) if f.name not in names]
+        start = start_fit([h.fit.free[k] for k in places], h.fit.x[places])
+        return Hypothesis(tuple(e for e in h.effects if e != effect), self.descend(start, ((3.0, 4), (1.0, 8))), {})
 
     def is_near(self, h: Hypothesis, far: float = 7.0) -> bool:
         """Whether a fit leaves so little that beginning again elsewhere may help."""
@@ -989,9 +991,9 @@ class JointSearch:
         return map_in_threads(do, items, self.problem.workers)
 
 
-def _keep_best(h: Hypothesis, others: Iterable[Fit]) -> Hypothesis:
+def _keep_best(h: Hypothesis, fits: Iterable[Fit]) -> Hypothesis:
     """The hypothesis with the best of its fit and some others."""
-    return replace(h, fit=min(h.fit, *others, key=lambda fit: fit.cost))
+    return replace(h, fit=min(h.fit, *fits, key=lambda fit: fit.cost))
 
 
 def _describe(h: Hypothesis) -> str:
@@ -1049,22 +1051,23 @@ class Beside:
         return len(self.explanations) > 1
 
 
-def average_explanations(found: Sequence[Explanation], marks: Mapping[str, Mapping[str, Value]] | None = None
+def average_explanations(candidates: Sequence[Explanation], marks: Mapping[str, Mapping[str, Value]] | None = None
                          ) -> Beside:
     """The explanations with their probabilities, and the sizes averaged over them.
 
     One that leaves more than noise does not count beside one that does not.
     """
-    explained = [each for each in found if each.refinement.is_explained] or [min(found, key=_compute_charged_cost)]
-    weights = weigh_costs([_compute_charged_cost(each) for each in explained])
-    counted = sorted((pair for pair in zip(weights, explained, strict=True) if pair[0] >= WEIGHT_COUNTS),
-                     key=lambda pair: -pair[0])
-    total = sum(weight for weight, _ in counted)
-    kept = tuple(Explanation(e.effects, e.parameters, e.refinement, weight / total) for weight, e in counted)
-    faults = kept[0].refinement.faults
-    weights = [e.weight for e in kept]
-    sizes = {f.name: mix_estimates([e.refinement.sizes[f.name] for e in kept], weights) for f in faults}
-    return Beside(kept, sizes, marks or {}, tuple(f.name for f in faults if _is_disputed(f, kept)))
+    rivals = ([each for each in candidates if each.refinement.is_explained]
+              or [min(candidates, key=_compute_charged_cost)])
+    weights = weigh_costs([_compute_charged_cost(each) for each in rivals])
+    pairs = sorted((pair for pair in zip(weights, rivals, strict=True) if pair[0] >= WEIGHT_COUNTS),
+                   key=lambda pair: -pair[0])
+    total = sum(weight for weight, _ in pairs)
+    explanations = tuple(Explanation(e.effects, e.parameters, e.refinement, weight / total) for weight, e in pairs)
+    faults = explanations[0].refinement.faults
+    weights = [e.weight for e in explanations]
+    sizes = {f.name: mix_estimates([e.refinement.sizes[f.name] for e in explanations], weights) for f in faults}
+    return Beside(explanations, sizes, marks or {}, tuple(f.name for f in faults if _is_disputed(f, explanations)))
 
 
 def weigh_costs(costs: Sequence[float]) -> list[float]:
@@ -1072,8 +1075,8 @@ def weigh_costs(costs: Sequence[float]) -> list[float]:
 
     Within `GAIN_TIE` of the best they are equally likely: fits that end in rough valleys do not tell more.
     """
-    likely = [math.exp(-0.5 * min(max(cost - min(costs) - GAIN_TIE, 0.0), 700.0)) for cost in costs]
-    return [each / sum(likely) for each in likely]
+    likelihoods = [math.exp(-0.5 * min(max(cost - min(costs) - GAIN_TIE, 0.0), 700.0)) for cost in costs]
+    return [each / sum(likelihoods) for each in likelihoods]
 
 
 def _compute_charged_cost(e: Explanation | Hypothesis) -> float:

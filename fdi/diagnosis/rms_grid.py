@@ -93,24 +93,24 @@ def search_grid(trace: Trace, model: Model | None = None, faults: Sequence[Fault
     first, second = faults
     parts = trace.sections()
     kinds = np.repeat([s.kind for s in parts], [s.stop - s.start for s in parts])
-    measured = ~np.isnan(trace.mask_unusable(trace.declared.controlled.name))
-    rows = {kind: chosen for kind in ("step", "ramp") if (chosen := (kinds == kind) & measured).any()}
+    is_measured = ~np.isnan(trace.mask_unusable(trace.declared.controlled.name))
+    rows = {kind: mask for kind in ("step", "ramp") if (mask := (kinds == kind) & is_measured).any()}
     require(rows, "trace", trace.declared.command.name, "steps or ramps, for the RMS grid")
     axes = np.linspace(*first.axis, CELLS), np.linspace(*second.axis, CELLS)
     values = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     has_monitor = model.kind.name == "eha" and (first.parameter, second.parameter) == MONITORED
     runs = _Runs(trace, model, (first, second), drive, rows, has_monitor)
-    tried = {ratio: runs.compute_maps(values, ratio) for ratio in (sliding if has_monitor else (1.0,))}
-    joint = {ratio: runs.join_maps(maps) for ratio, maps in tried.items()}
+    maps_by_ratio = {ratio: runs.compute_maps(values, ratio) for ratio in (sliding if has_monitor else (1.0,))}
+    joint = {ratio: runs.join_maps(maps) for ratio, maps in maps_by_ratio.items()}
     ratio = min(joint, key=lambda ratio: float(joint[ratio].min()))
-    step, ramp = (_make_map(tried[ratio][kind], axes) if kind in rows else None for kind in ("step", "ramp"))
+    step, ramp = (_make_map(maps_by_ratio[ratio][kind], axes) if kind in rows else None for kind in ("step", "ramp"))
     both = _make_map(joint[ratio], axes)
-    near = _follow_valley(both, axes, second)
-    finer = runs.join_maps(runs.compute_maps(near, ratio))
+    pairs = _follow_valley(both, axes, second)
+    finer = runs.join_maps(runs.compute_maps(pairs, ratio))
     deepest = int(finer.argmin())
-    best = Point((float(near[deepest, 0]), float(near[deepest, 1])), float(finer[deepest]))
+    best = Point((float(pairs[deepest, 0]), float(pairs[deepest, 1])), float(finer[deepest]))
     return Grid((first, second), axes, step, ramp, both, merge_minima(step, ramp, (first, second)), best,
-                len(values) * len(tried) + len(near), trace.declared.controlled.unit)
+                len(values) * len(maps_by_ratio) + len(pairs), trace.declared.controlled.unit)
 
 
 def _follow_valley(joint: Map, axes: tuple[Floats, Floats], second: Fault, points: int = 13) -> Floats:
@@ -120,9 +120,9 @@ def _follow_valley(joint: Map, axes: tuple[Floats, Floats], second: Fault, point
     Faults that change the response alike make a valley across the grid, and the deepest of its cells is mostly the one
     that happens to lie on the floor.
     """
-    apart = float(axes[1][1] - axes[1][0])
+    spacing = float(axes[1][1] - axes[1][0])
     floor = axes[1][joint.rms.argmin(axis=1)]
-    across = np.clip(floor[:, None] + apart * np.linspace(-1.0, 1.0, points), *second.range)
+    across = np.clip(floor[:, None] + spacing * np.linspace(-1.0, 1.0, points), *second.range)
     return np.column_stack([np.repeat(axes[0], points), across.reshape(-1)])
 
 
@@ -162,12 +162,12 @@ class _Runs(NamedTuple):
 
     def reduce_runs(self, runs: Floats) -> Floats:
         """RMS by kind of section, (m, kinds), of runs (m, columns, n), the controlled signal first."""
-        found = []
-        for chosen in self.rows.values():
-            left = runs[:, 0].T[chosen] - self.trace.controlled[chosen, None]
-            left -= left.mean(axis=0)  # a load or a null bias is but an offset, as the plant is pulled
-            found.append(np.sqrt(np.einsum("ij,ij->j", left, left) / len(left)))
-        return np.stack(found, -1)
+        rms = []
+        for rows in self.rows.values():
+            residual = runs[:, 0].T[rows] - self.trace.controlled[rows, None]
+            residual -= residual.mean(axis=0)  # a load or a null bias is but an offset, as the plant is pulled
+            rms.append(np.sqrt(np.einsum("ij,ij->j", residual, residual) / len(residual)))
+        return np.stack(rms, -1)
 
     def join_maps(self, maps: dict[str, Floats]) -> Floats:
         """RMS over the rows of both kinds, (m,)."""
