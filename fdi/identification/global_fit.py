@@ -51,8 +51,8 @@ def scale_values(free: Sequence[Free], values: Mapping[str, float]) -> Floats:
     x = np.zeros(len(free))
     for k, f in enumerate(free):
         if f.name in values:
-            known = values[f.name]
-            value = max(known / values[f.leader], 1.0) if isinstance(f, LogFrictionRatio) else known
+            parameter = values[f.name]
+            value = max(parameter / values[f.leader], 1.0) if isinstance(f, LogFrictionRatio) else parameter
             place = math.log(value) if isinstance(f, LogFree) else value
             x[k] = (min(max(place, f.low), f.high) - f.centre) / f.scale
     return x
@@ -64,9 +64,9 @@ def sample_starts(free: Sequence[Free], seed: int) -> Floats:
     Tolerances are not scattered.
     """
     spread = 0.4 * np.array([is_wide(f) for f in free])
-    scattered = spread * np.random.default_rng(seed).standard_normal((SCATTERED, len(free)))
+    offsets = spread * np.random.default_rng(seed).standard_normal((SCATTERED, len(free)))
     low, high = scaled_bounds(free)
-    return np.clip(np.vstack([np.zeros(len(free)), scattered]), low, high)
+    return np.clip(np.vstack([np.zeros(len(free)), offsets]), low, high)
 
 
 def is_wide(f: Free, tolerance: float = 0.04) -> bool:
@@ -78,8 +78,8 @@ def fit_from_afar(problem: LogProblem, free: Sequence[Free], seed: int, progress
     """The best fit from the data sheet's values and from scattered starts."""
     starts, factor = sample_starts(free, seed), FIT_STAGES[0][0]
     costs = compute_misfit(scale_noise(problem, factor).compute_white_residuals(free, starts))
-    chosen = [starts[0], *starts[[k for k in np.argsort(costs) if k != 0][:FIT_STAGES[0][1] - 1]]]
-    fits = [start_fit(free, x) for x in chosen]
+    first_starts = [starts[0], *starts[[k for k in np.argsort(costs) if k != 0][:FIT_STAGES[0][1] - 1]]]
+    fits = [start_fit(free, x) for x in first_starts]
     for number, (factor, count, rounds, steps) in enumerate(FIT_STAGES):
         progress(f"fitting, {len(fits[:count])} at a time", 0.1 + 0.15 * number)
         stage = replace(problem, workers=1, steps=steps)
@@ -92,14 +92,14 @@ def fit_from_afar(problem: LogProblem, free: Sequence[Free], seed: int, progress
     return fits[0]
 
 
-def search_other_valleys(problem: LogProblem, found: Fit, seed: int, progress: Progress = ignore_progress) -> Fit:
+def search_other_valleys(problem: LogProblem, fit: Fit, seed: int, progress: Progress = ignore_progress) -> Fit:
     """The best of a fit and of searches by populations, two at a time, until one leaves only noise.
 
     A narrow search begins at the best fit so far. A wide one begins at the data sheet's values, which know nothing of
     the valley that the fit ended in. Each finds what the other misses (docs/identify.md). The searches take coarse
     steps; what they find is fitted to the `problem` with its own steps.
     """
-    best = found
+    best = fit
     for attempt in range(SEARCHES):
         if is_fitted(best):
             break
@@ -112,9 +112,9 @@ def search_other_valleys(problem: LogProblem, found: Fit, seed: int, progress: P
                    else _search_narrowly(coarse, best, seed + number))
             return descend(problem.alone, end, ((1.0, 8),))
 
-        before = best.misfit - np.count_nonzero(best.white)
+        excess = best.misfit - np.count_nonzero(best.white)
         best = min(best, *map_in_threads(search, (False, True), problem.workers), key=lambda fit: fit.cost)
-        if best.misfit - np.count_nonzero(best.white) > (1.0 - SEARCH_GAIN) * before:
+        if best.misfit - np.count_nonzero(best.white) > (1.0 - SEARCH_GAIN) * excess:
             break  # physics is missing, or a range is too narrow: no other valley is deeper
     return best
 
@@ -123,9 +123,9 @@ def _search_narrowly(problem: LogProblem, best: Fit, seed: int) -> Fit:
     def slide(problem: LogProblem, fit: Fit, rounds: int, factor: float) -> Fit:
         return descend(problem, fit, ((factor, rounds),))
 
-    begun = slide(problem, start_fit(best.free, best.x), 3, NARROW_STAGES[0][0])
-    spread = 4.0 * begun.covariance + np.diag(_widen_frictions(best.free, 0.15, 0.0) ** 2)
-    return follow_population(problem, begun, spread, NARROW_STAGES, seed, slide)
+    start = slide(problem, start_fit(best.free, best.x), 3, NARROW_STAGES[0][0])
+    spread = 4.0 * start.covariance + np.diag(_widen_frictions(best.free, 0.15, 0.0) ** 2)
+    return follow_population(problem, start, spread, NARROW_STAGES, seed, slide)
 
 
 def _widen_frictions(free: Sequence[Free], static: float, dynamic: float) -> Floats:
@@ -137,8 +137,8 @@ def _widen_frictions(free: Sequence[Free], static: float, dynamic: float) -> Flo
 def polish_fit(problem: LogProblem, fit: Fit, seed: int, generations: int = 25) -> Fit:
     """The fit at the lowest place near it: slopes stop at the first ridge of a rough valley, a population does not."""
     spread = 4.0 * fit.covariance + np.diag(_widen_frictions(fit.free, 0.02, 0.0) ** 2)
-    found = evolve_fit(problem, fit, spread, generations, seed)
-    return min(fit, descend(problem, found, ((1.0, 4),)), key=lambda each: each.cost)
+    end = evolve_fit(problem, fit, spread, generations, seed)
+    return min(fit, descend(problem, end, ((1.0, 4),)), key=lambda each: each.cost)
 
 
 def is_fitted(fit: Fit) -> bool:
@@ -154,12 +154,12 @@ def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:
     steps = [(k, way / f.scale if isinstance(f, LogFree) else way) for k, f in enumerate(free) if is_wide(f)
              for way in GRID]
     for _ in range(rounds):
-        tried = np.array([x, *(np.clip(put_unknown(x, k, x[k] + step), low, high) for k, step in steps)])
-        costs = compute_misfit(problem.compute_white_residuals(free, tried)) + tried**2 @ prior
+        trials = np.array([x, *(np.clip(put_unknown(x, k, x[k] + step), low, high) for k, step in steps)])
+        costs = compute_misfit(problem.compute_white_residuals(free, trials)) + trials**2 @ prior
         best = int(np.argmin(costs))
         if best == 0 or costs[best] > costs[0] - 1.0:
             break
-        x = tried[best]
+        x = trials[best]
     return replace(fit, x=x)
 
 
@@ -189,6 +189,6 @@ def profile_unknowns(problem: LogProblem, fit: Fit) -> Fit:
 
 def put_unknown(x: Floats, k: int, value: float) -> Floats:
     """Scaled unknowns, (p,), with another value of unknown k."""
-    moved = x.copy()
-    moved[k] = value
-    return moved
+    unknowns = x.copy()
+    unknowns[k] = value
+    return unknowns

@@ -148,23 +148,23 @@ def read_free_parameters(model: Model, source: str | Path | None) -> tuple[Range
     """
     path = find_shipped_model(str(source)) or Path(str(source))
     is_model_file = source is not None and path.suffix == ".toml" and path.is_file()
-    named = read_toml(path).get("identify") if is_model_file else None
-    if named is not None:
-        return parse_free_parameters(named, model, source)
+    own_tables = read_toml(path).get("identify") if is_model_file else None
+    if own_tables is not None:
+        return parse_free_parameters(own_tables, model, source)
     usual = Path(str(files("plant").joinpath("models", "nominal.toml")))
     tables = read_toml(usual)["identify"]
     if {f"{group}.{field}" for group, fields in tables.items() for field in fields} <= model.values.keys():
         return parse_free_parameters(tables, model, usual.name)
     widths: dict[str, Width] = dict.fromkeys(list_relative_tolerances(model, model.list_names()), USUAL_FACTOR)
     if model.kind.foreign is not None:  # the map of an FMU gives ranges
-        known = {name: find_quantity(name, plant=model.plant) for name in model.list_names()}
-        widths |= {name: (q.low, q.high) for name, q in known.items()
+        quantities = {name: find_quantity(name, plant=model.plant) for name in model.list_names()}
+        widths |= {name: (q.low, q.high) for name, q in quantities.items()
                    if math.isfinite(q.high - q.low) and not q.is_whole
                    and name.partition(".")[0] not in ("controller", "sensors")}
-    scattering = {name: _parse_range(name, width, model, model.name) for name, width in widths.items()
-                  if model[name] > 0.0 or isinstance(width, tuple)}
-    require(scattering, source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
-    return tuple(scattering.values())
+    ranges = {name: _parse_range(name, width, model, model.name) for name, width in widths.items()
+              if model[name] > 0.0 or isinstance(width, tuple)}
+    require(ranges, source, "identify", "tables [identify.GROUP] that say what is free (docs/identify.md)")
+    return tuple(ranges.values())
 
 
 def parse_free_parameters(tables: object, model: Model, where: object) -> tuple[Range, ...]:
@@ -173,14 +173,14 @@ def parse_free_parameters(tables: object, model: Model, where: object) -> tuple[
     Raises:
         InputError: an unknown parameter, or a factor or range that cannot be.
     """
-    found = {}
+    ranges = {}
     for name, width in build_dataclass(FreeParameters, {"identify": tables}, Place(str(where))).identify.items():
         find_quantity(name, where, model.plant)
         require(name in model.values, where, f"identify.{name}",
                 f"a parameter that the model has; add {name.partition('.')[0]} to its effects")
-        found[name] = _parse_range(name, width, model, where)
-    require(found, where, "identify", "at least one free parameter")
-    return tuple(found[name] for name in model.list_names() if name in found)
+        ranges[name] = _parse_range(name, width, model, where)
+    require(ranges, where, "identify", "at least one free parameter")
+    return tuple(ranges[name] for name in model.list_names() if name in ranges)
 
 
 def _parse_range(name: str, width: Width, model: Model, where: object) -> Range:
@@ -244,33 +244,34 @@ class IdentificationRuns(NamedTuple):
     sources: tuple[Source, ...]  # of all of them, the held-out ones last
 
 
-def read_identification_runs(model: Model, ranges: Sequence[Range], fitted: Sequence[str | Trace],
-                             held_out: Sequence[str | Trace], signals: Sequence[str] | None = None
+def read_identification_runs(model: Model, ranges: Sequence[Range], fitted_runs: Sequence[str | Trace],
+                             held_out_runs: Sequence[str | Trace], signals: Sequence[str] | None = None
                              ) -> IdentificationRuns:
     """The runs of an identification, from files or traces, made ready for replay.
 
     Raises:
         InputError: a file or trace that cannot be used, or a run given twice.
     """
-    require(fitted, "RUN", "", "at least one run to fit")
-    traces, sources = read_traces([*fitted, *held_out], model)
-    count = len(fitted)
+    require(fitted_runs, "RUN", "", "at least one run to fit")
+    traces, sources = read_traces([*fitted_runs, *held_out_runs], model)
+    count = len(fitted_runs)
     require_distinct(sources, "RUN", "other runs", count)
     outputs = tuple(s.name for s in model.kind.signals.outputs)
     for name in signals or ():
         require(name in outputs, "--signals", name, f"some of {','.join(outputs)}")
-    chosen = [s for s in outputs if any(s in t.signals for t in traces[:count]) and (signals is None or s in signals)]
-    require(chosen, sources[0].file, ", ".join(signals or outputs), "a signal that a run to fit has")
+    used_outputs = [s for s in outputs if any(s in t.signals for t in traces[:count])
+                    and (signals is None or s in signals)]
+    require(used_outputs, sources[0].file, ", ".join(signals or outputs), "a signal that a run to fit has")
     limits = {s.limit for s in model.kind.signals if s.limit}
     widest = replace(model, values={**model.values, **{r.name: r.high for r in ranges if r.name in limits}})
-    prepared = [_prepare(t, widest, [s for s in chosen if s in t.signals] or chosen, source)
-                for t, source in zip(traces, sources, strict=True)]
-    model = match_period(model, prepared[0], SAME_PERIOD)
+    runs = [_prepare(t, widest, [s for s in used_outputs if s in t.signals] or used_outputs, source)
+            for t, source in zip(traces, sources, strict=True)]
+    model = match_period(model, runs[0], SAME_PERIOD)
     period = model["controller.period"]
-    for trace, source in zip(prepared, sources, strict=True):
+    for trace, source in zip(runs, sources, strict=True):
         require(abs(trace.period / period - 1.0) <= SAME_PERIOD, source.file, "t",
                 f"rows {period:g} s apart, as in {sources[0].file}")
-    return IdentificationRuns(model, tuple(prepared[:count]), tuple(prepared[count:]), tuple(sources))
+    return IdentificationRuns(model, tuple(runs[:count]), tuple(runs[count:]), tuple(sources))
 
 
 def _prepare(trace: Trace, model: Model, outputs: Sequence[str], source: Source) -> Trace:
@@ -384,31 +385,31 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: ScaledProble
     """
     x = scale_values(free, model.values)
     present = replace(problem, model=silence_readings(model), steps=STEPS, bare=None, _lanes={})
-    known = np.diag([f.prior**-2 for f in free])
+    present_information = np.diag([f.prior**-2 for f in free])
     if fit is not None:
-        known = known + _measure_information(present, free, x)
-    found = {}
+        present_information = present_information + _measure_information(present, free, x)
+    information = {}
     for experiment in list_experiments(model):
         com = experiment.build(model)
         part = np.arange(len(com)) / len(com)
         force = _measure_push(model) * experiment.is_loaded
         load = force * (((part > 0.2) & (part < 0.45)).astype(float) - ((part >= 0.45) & (part < 0.7)))
         run = replace(present, trace=_simulate(model, com, load, problem.trace.outputs), also=(), _lanes={})
-        found[experiment.name] = known + _measure_information(run, free, x)
+        information[experiment.name] = present_information + _measure_information(run, free, x)
     what = {e.name: e.what for e in EXPERIMENTS}
     outputs = model.kind.signals.outputs
     missing = [s for s in outputs if s.name not in problem.trace.outputs]
     if missing and fit is not None and all(s.noise for s in outputs):
         runs = [_simulate(model, t.command, t.load, problem.trace.output_names) for t in (problem.trace, *problem.also)]
         noise = tuple(white_noise(model[s.noise]) for s in outputs)
-        sensed = replace(present, trace=runs[0], also=tuple(runs[1:]), noise=noise, _lanes={})
-        found["sensors"] = np.diag([f.prior**-2 for f in free]) + _measure_information(sensed, free, x)
+        sensor_problem = replace(present, trace=runs[0], also=tuple(runs[1:]), noise=noise, _lanes={})
+        information["sensors"] = np.diag([f.prior**-2 for f in free]) + _measure_information(sensor_problem, free, x)
         what["sensors"] = f"the same runs with {' and '.join(s.symbol for s in missing)} measured"
-    shares = {name: _compute_shares(free, information) for name, information in found.items()}
+    shares = {name: _compute_shares(free, matrix) for name, matrix in information.items()}
     for name in unseen:
         share, best = min((shares[experiment][name], experiment) for experiment in shares)
-        chosen, words = (best, what[best]) if share <= IDENTIFIABLE_SHARE else (None, "")
-        yield Advice(name, chosen, words, share)
+        choice, words = (best, what[best]) if share <= IDENTIFIABLE_SHARE else (None, "")
+        yield Advice(name, choice, words, share)
 
 
 def _simulate(model: Model, com: Floats, load: Floats, outputs: Sequence[str]) -> Trace:
@@ -547,7 +548,7 @@ class Settled(NamedTuple):
         return max(e.decided_ratio for e in self.errors if not e.is_held_out)
 
 
-def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace], held_out: Sequence[Trace],
+def identify_model(model: Model, ranges: Sequence[Range], fitted_runs: Sequence[Trace], held_out_runs: Sequence[Trace],
                    sources: Sequence[Source], seed: int = 0, progress: Progress = ignore_progress,
                    workers: int | None = None) -> Identification:
     """Fit the free parameters of a model to runs of one actuator.
@@ -555,56 +556,59 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted: Sequence[Trace
     Args:
         model: with the values of the data sheet.
         ranges: of the free parameters.
-        fitted: runs, prepared for replay, each with the outputs that were measured in it.
-        held_out: runs that no fit sees, prepared.
+        fitted_runs: prepared for replay, each with the outputs that were measured in it.
+        held_out_runs: those that no fit sees, prepared.
         sources: of all of them, in this order.
         seed: of the scattered starts.
         progress: called with each stage and the share done, 0 to 1.
         workers: threads; default one a core.
     """
-    runs = (*fitted, *held_out)
-    fitted = [leave_out_rest(t, model) for t in fitted]
-    notes = [f"{source.file}: {note}" for trace, source in zip((*fitted, *held_out), sources, strict=True)
+    runs = (*fitted_runs, *held_out_runs)
+    fitted_runs = [leave_out_rest(t, model) for t in fitted_runs]
+    notes = [f"{source.file}: {note}" for trace, source in zip((*fitted_runs, *held_out_runs), sources, strict=True)
              for note in trace.notes]
-    floors = [sensor_floors(t, model) for t in fitted]
-    floor = {s: float(np.median([f[s].value for f in floors if s in f])) for s in fitted[0].output_names
+    floors = [sensor_floors(t, model) for t in fitted_runs]
+    floor = {s: float(np.median([f[s].value for f in floors if s in f])) for s in fitted_runs[0].output_names
              if any(s in f for f in floors)}
-    if not any(_moves(t) for t in fitted):
-        controlled, least = model.kind.signals.controlled, MOVING_RAM * fitted[0].scale
+    if not any(_moves(t) for t in fitted_runs):
+        controlled, least = model.kind.signals.controlled, MOVING_RAM * fitted_runs[0].scale
         reason = (f"no run to fit moves the {controlled.phrase} by {least * controlled.shown_scale:g} "
                   f"{controlled.shown_unit}: at rest nothing can be identified")
-        return _tell_nothing(model, ranges, runs, sources, len(fitted), floor, reason, notes)
-    gains = read_controller(fitted) if model.kind.controller else None
+        return _tell_nothing(model, ranges, runs, sources, len(fitted_runs), floor, reason, notes)
+    gains = read_controller(fitted_runs) if model.kind.controller else None
     free = list_unknowns(model, tuple(ranges))
-    parts, remarks = cut_long_runs(fitted, sources, model, floor)
+    parts, remarks = cut_long_runs(fitted_runs, sources, model, floor)
     problem = make_problem(model, parts, floor, workers or count_threads())
     notes += remarks
 
     def settle(problem: ScaledProblem, fit: Fit) -> Settled:
         progress("which parameters the runs show", 0.65)
-        hidden = find_hidden(problem, fit, {r.name: r for r in ranges})
-        problem, fit = hold_parameters(problem, fit, {name: value for name, (value, _, _) in hidden.items()})
+        hidden_values = find_hidden(problem, fit, {r.name: r for r in ranges})
+        problem, fit = hold_parameters(problem, fit, {name: value for name, (value, _, _) in hidden_values.items()})
         progress("last fits, with finer steps", 0.7)
         problem, fit = finish(problem, fit, seed, progress)
         progress("judging", 0.92)
-        found = build_model(model, problem, fit, gains)
-        return Settled(problem, fit, hidden, found, *measure_errors(model, found, runs, sources, len(fitted), floor))
+        fitted_model = build_model(model, problem, fit, gains)
+        return Settled(problem, fit, hidden_values, fitted_model,
+                       *measure_errors(model, fitted_model, runs, sources, len(fitted_runs), floor))
 
-    settled = settle(problem, fit_from_afar(problem, free, seed, progress))
-    if model.kind.correct is not None and settled.worst_fitted > FITTED_RUN_WORST:
+    best = settle(problem, fit_from_afar(problem, free, seed, progress))
+    if model.kind.correct is not None and best.worst_fitted > FITTED_RUN_WORST:
         progress("fitting the beginnings of motions", 0.6)
-        moving = [leave_out_rest(t, model, memory=0.0) for t in runs[:len(fitted)]]
-        parts, _ = cut_long_runs(moving, sources, model, floor)
-        begin = fit_beginnings(make_problem(settled.model, parts, floor, problem.workers), free, floor)
-        settled = min(settled, settle(*begin), key=lambda each: each.worst_fitted)
-    problem, fit, hidden, found, errors, residuals = settled
-    estimates, covariance = estimate_parameters(model, ranges, fit, hidden)
+        moving_runs = [leave_out_rest(t, model, memory=0.0) for t in runs[:len(fitted_runs)]]
+        parts, _ = cut_long_runs(moving_runs, sources, model, floor)
+        begin = fit_beginnings(make_problem(best.model, parts, floor, problem.workers), free, floor)
+        best = min(best, settle(*begin), key=lambda each: each.worst_fitted)
+    problem, fit, hidden_values, fitted_model, errors, residuals = best
+    estimates, covariance = estimate_parameters(model, ranges, fit, hidden_values)
     verdict, reason = decide_verdict(estimates, errors)
     progress("which runs would show more", 0.95)
     unseen = [e.name for e in estimates if not e.is_identifiable]
-    advice = advise_experiments(found, list_unknowns(model, tuple(ranges)), problem, fit, unseen) if unseen else ()
-    return Identification(verdict, reason, model, found, estimates, gains, list_correlations(estimates, covariance),
-                          tuple(advice), errors, floor, runs, residuals, tuple(sources), tuple(notes))
+    advice = (advise_experiments(fitted_model, list_unknowns(model, tuple(ranges)), problem, fit, unseen) if unseen
+              else ())
+    return Identification(verdict, reason, model, fitted_model, estimates, gains,
+                          list_correlations(estimates, covariance), tuple(advice), errors, floor, runs,
+                          residuals, tuple(sources), tuple(notes))
 
 
 def cut_long_runs(runs: Sequence[Trace], sources: Sequence[Source], model: Model, floor: Mapping[str, float]
@@ -645,9 +649,9 @@ class ScaledProblem(LogProblem):
         pressing = {"jack.area": 1.0, "valve.flow_gain": 1.0, "jack.leakage": 2.0 + leaking.get("jack.leakage", 0.0)}
         every = find_flat_directions(self, fit.free, fit.x, (pressing,), PRIORS_KNOW_MORE_MISFIT)
         more = every[:, find_flat_directions(self, fit.free, fit.x).shape[1]:]
-        known = np.sum((more.T / [f.prior for f in fit.free]) ** 2, axis=1)  # by what is known beforehand
-        widened: Floats = fit.covariance + (more / known) @ more.T
-        return widened
+        prior_information = np.sum((more.T / [f.prior for f in fit.free]) ** 2, axis=1)  # by what is known beforehand
+        covariance: Floats = fit.covariance + (more / prior_information) @ more.T
+        return covariance
 
     def _list_ways(self, free: Sequence[Free], x: Floats) -> tuple[Mapping[str, float], ...]:
         """Directions in which an actuator of another size may change beside those of a healthy unit: powers by name."""
@@ -662,10 +666,10 @@ class ScaledProblem(LogProblem):
         return leaking, flapper, sticking, turning
 
 
-def make_problem(model: Model, fitted: Sequence[Trace], floor: Mapping[str, float], workers: int) -> ScaledProblem:
+def make_problem(model: Model, runs: Sequence[Trace], floor: Mapping[str, float], workers: int) -> ScaledProblem:
     """The runs to fit with white noise of the floor's size; a signal that a run lacks counts nothing in it."""
     noise = tuple(white_noise(level) for level in floor.values())
-    first, *others = (replace(t, outputs=tuple(floor)) for t in fitted)
+    first, *others = (replace(t, outputs=tuple(floor)) for t in runs)
     return ScaledProblem(silence_readings(model), first, noise, workers=workers, also=tuple(others))
 
 
@@ -687,20 +691,20 @@ def find_hidden(problem: ScaledProblem, fit: Fit, ranges: Mapping[str, Range]
         trials.append(put_unknown(fit.x, k, high if high - fit.x[k] > near else high - inside))
     costs = compute_misfit(problem.compute_white_residuals(fit.free, np.array(trials)))
     is_open = (np.abs(costs[1:] - costs[0]) < OPEN_MISFIT).reshape(-1, 2)
-    found = {}
+    hidden_values = {}
     for (k, r), (below, above) in zip(places, is_open.tolist(), strict=True):
         if below or above:
             f = fit.free[k]
             low = r.low if below else _find_edge(problem, fit, k, f.low)
             high = r.high if above else _find_edge(problem, fit, k, f.high)
-            found[f.name] = (min(max(r.centre, low), high), low, high)
+            hidden_values[f.name] = (min(max(r.centre, low), high), low, high)
     for k, f in enumerate(fit.free):
-        if isinstance(f, LogFrictionRatio) and f.leader in found:  # it moved as well, and no signal changed
+        if isinstance(f, LogFrictionRatio) and f.leader in hidden_values:  # it moved as well, and no signal changed
             ratio = f.value(float(fit.x[k]))
             least, most = (ranges[f.name].low, ranges[f.name].high) if f.name in ranges else (0.0, math.inf)
-            value, low, high = (min(max(ratio * each, least), most) for each in found[f.leader])
-            found[f.name] = value, low, high
-    return found
+            value, low, high = (min(max(ratio * each, least), most) for each in hidden_values[f.leader])
+            hidden_values[f.name] = value, low, high
+    return hidden_values
 
 
 def _find_edge(problem: ScaledProblem, fit: Fit, k: int, end: float, rounds: int = 3, parts: int = 15) -> float:
@@ -712,22 +716,22 @@ def _find_edge(problem: ScaledProblem, fit: Fit, k: int, end: float, rounds: int
         line = np.linspace(good, bad, parts + 1)
         costs = compute_misfit(problem.compute_white_residuals(
             fit.free, np.array([fit.x, *(put_unknown(fit.x, k, place) for place in line)])))
-        seen = np.flatnonzero(costs[1:] - costs[0] >= OPEN_MISFIT)
-        if not len(seen):
+        indices = np.flatnonzero(costs[1:] - costs[0] >= OPEN_MISFIT)
+        if not len(indices):
             break
-        first = max(int(seen[0]), 1)
+        first = max(int(indices[0]), 1)
         good, bad = float(line[first - 1]), float(line[first])
     return f.value(good)
 
 
-def hold_parameters(problem: ScaledProblem, fit: Fit, held: Mapping[str, float]) -> tuple[ScaledProblem, Fit]:
-    """The problem and the fit without some unknowns, which keep the values in `held`."""
-    if not held:
+def hold_parameters(problem: ScaledProblem, fit: Fit, fixed_values: Mapping[str, float]) -> tuple[ScaledProblem, Fit]:
+    """The problem and the fit without some unknowns, which keep the values in `fixed_values`."""
+    if not fixed_values:
         return problem, fit
-    kept = [k for k, f in enumerate(fit.free) if f.name not in held]
-    values = limit_friction_values({**problem.model.values, **held})
+    places = [k for k, f in enumerate(fit.free) if f.name not in fixed_values]
+    values = limit_friction_values({**problem.model.values, **fixed_values})
     return (replace(problem, model=replace(problem.model, values=values), _lanes={}),
-            start_fit([fit.free[k] for k in kept], fit.x[kept]))
+            start_fit([fit.free[k] for k in places], fit.x[places]))
 
 
 def count_last_steps(model: Model) -> int:
@@ -787,21 +791,22 @@ def fit_beginnings(problem: ScaledProblem, free: Sequence[Free], floor: Mapping[
 def build_model(model: Model, problem: ScaledProblem, fit: Fit, gains: ControllerGains | None) -> Model:
     """The model whose nominal values are those that were found."""
     values = problem.list_values(fit.free, fit.x)
-    held = {n: v for n, v in problem.model.values.items() if v != model.values.get(n) and not n.startswith("sensors.")
-            and n not in values}
+    fixed_values = {n: v for n, v in problem.model.values.items() if v != model.values.get(n)
+                    and not n.startswith("sensors.") and n not in values}
     noise = {problem.trace.declared.find(s).noise: n.level
              for s, n in zip(problem.trace.outputs, problem.noise, strict=True)}
-    read = {} if gains is None else gains.values
-    found = {n: float(f"{v:.6g}") for n, v in {**held, **values, **read, **noise}.items() if n in model.values}
-    complete = limit_friction_values({**model.values, **found})
+    gain_values = {} if gains is None else gains.values
+    new_values = {n: float(f"{v:.6g}") for n, v in {**fixed_values, **values, **gain_values, **noise}.items()
+                  if n in model.values}
+    complete = limit_friction_values({**model.values, **new_values})
     nominal = model.kind.nominal
-    own = {n for n in nominal if n in model.values and model.values[n] != nominal[n]}
-    own |= {n for n in found if n.partition(".")[0] in model.kind.parameters}
-    return replace(model, values=complete, design={n: complete[n] for n in model.list_names() if n in own})
+    names = {n for n in nominal if n in model.values and model.values[n] != nominal[n]}
+    names |= {n for n in new_values if n.partition(".")[0] in model.kind.parameters}
+    return replace(model, values=complete, design={n: complete[n] for n in model.list_names() if n in names})
 
 
 def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
-                        hidden: Mapping[str, tuple[float, float, float]]) -> tuple[tuple[Estimate, ...], Floats]:
+                        hidden_values: Mapping[str, tuple[float, float, float]]) -> tuple[tuple[Estimate, ...], Floats]:
     """The free parameters with their intervals, and the correlation matrix of them; hidden ones have no correlation."""
     free = fit.free
     names = [f.name for f in free]
@@ -810,11 +815,11 @@ def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
                        for r in ranges])
     covariance = slopes @ fit.covariance @ slopes.T
     spread = np.sqrt(np.diag(covariance))
-    found = []
+    estimates = []
     for i, r in enumerate(ranges):
-        if r.name in hidden:
-            value, low, high = hidden[r.name]
-            found.append(Estimate(r.name, r.unit, model[r.name], r.low, r.high, value, low, high, False, 1.0))
+        if r.name in hidden_values:
+            value, low, high = hidden_values[r.name]
+            estimates.append(Estimate(r.name, r.unit, model[r.name], r.low, r.high, value, low, high, False, 1.0))
             continue
         value = values[r.name]
         factor, systematic = IDENTIFIED_INTERVAL_FACTOR * float(spread[i]), get_systematic_sd(r.name)
@@ -825,11 +830,11 @@ def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
         least, most = min(r.low, value), max(r.high, value)  # a static friction goes with the dynamic one, also beyond
         low, high = (min(max(float(end), least), most) for end in (low, high))
         share = half / r.half_width
-        seen = share <= IDENTIFIABLE_SHARE
-        found.append(Estimate(r.name, r.unit, model[r.name], r.low, r.high, value, low, high, seen, min(share, 1.0)))
+        estimates.append(Estimate(r.name, r.unit, model[r.name], r.low, r.high, value, low, high,
+                                  share <= IDENTIFIABLE_SHARE, min(share, 1.0)))
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = np.nan_to_num(covariance / np.outer(spread, spread))
-    return tuple(found), correlation
+    return tuple(estimates), correlation
 
 
 def list_correlations(estimates: Sequence[Estimate], matrix: Floats, least: float = 0.9) -> tuple[Correlation, ...]:
@@ -839,9 +844,9 @@ def list_correlations(estimates: Sequence[Estimate], matrix: Floats, least: floa
     return tuple(sorted(pairs, key=lambda pair: -abs(pair.value)))
 
 
-def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: Sequence[Source], fitted: int,
+def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: Sequence[Source], fitted_count: int,
                    floor: Mapping[str, float]) -> tuple[tuple[RunError, ...], tuple[tuple[Floats, Floats], ...]]:
-    """The error of each run with both models, the first `fitted` being those of the fit; and the residuals, SI.
+    """The error of each run with both models, the first `fitted_count` being those of the fit; and the residuals, SI.
 
     Where a replay has an observer, no fit saw the beginning of a motion: here it counts as far as it is decided.
     """
@@ -851,21 +856,21 @@ def measure_errors(before: Model, after: Model, runs: Sequence[Trace], sources: 
         noise = tuple(white_noise(1.0) for _ in trace.outputs)
         first, last = (Problem(silence_readings(model), trace, noise, steps=count_last_steps(model))
                        for model in (before, after))
-        left = [problem.compute_residuals((), np.empty((1, 0)))[0] for problem in (first, last)]
-        sizes = [{s: rms(r) for s, r in zip(trace.outputs, each, strict=True)} for each in left]
-        own = {s: floor[s] for s in trace.outputs}
-        decided, share, judged = sizes[1], 0.0, left[1]
-        is_seen = number < fitted and after.kind.correct is None
+        residual_pair = [problem.compute_residuals((), np.empty((1, 0)))[0] for problem in (first, last)]
+        sizes = [{s: rms(r) for s, r in zip(trace.outputs, each, strict=True)} for each in residual_pair]
+        floors = {s: floor[s] for s in trace.outputs}
+        decided, share, judged_residual = sizes[1], 0.0, residual_pair[1]
+        is_seen = number < fitted_count and after.kind.correct is None
         if not is_seen and _moves(trace) and not is_long(trace):  # nine replays of a long one take too much memory
-            undecided = find_undecided_rows(last, start_fit((), np.empty(0)), own)
+            undecided = find_undecided_rows(last, start_fit((), np.empty(0)), floors)
             share = float(undecided.mean())
             if 0.0 < share < 1.0:
-                decided = {s: rms(r[~undecided]) for s, r in zip(trace.outputs, left[1], strict=True)}
+                decided = {s: rms(r[~undecided]) for s, r in zip(trace.outputs, residual_pair[1], strict=True)}
             if after.kind.correct is not None:
-                judged = left[1][:, ~undecided]
-        typical = dict(zip(trace.outputs, compute_typical_rms(judged).tolist(), strict=True))
-        errors.append(RunError(source, number >= fitted, sizes[0], sizes[1], typical, own, decided, share))
-        residuals.append((left[0], left[1]))
+                judged_residual = residual_pair[1][:, ~undecided]
+        typical = dict(zip(trace.outputs, compute_typical_rms(judged_residual).tolist(), strict=True))
+        errors.append(RunError(source, number >= fitted_count, sizes[0], sizes[1], typical, floors, decided, share))
+        residuals.append((residual_pair[0], residual_pair[1]))
     return tuple(errors), tuple(residuals)
 
 
@@ -876,8 +881,8 @@ def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) ->
     if worse:
         worst = max(worse, key=lambda e: e.decided_ratio)
         kind = "held-out run" if worst.is_held_out else "run"
-        left = f"{worst.decided_ratio:.3g} noise floors of the {kind} {worst.source.file}"
-        return "UNEXPLAINED", f"the best parameters leave {left}"
+        residual = f"{worst.decided_ratio:.3g} noise floors of the {kind} {worst.source.file}"
+        return "UNEXPLAINED", f"the best parameters leave {residual}"
     unseen = [e.name for e in estimates if not e.is_identifiable]
     if len(unseen) == len(estimates):
         return "CANNOT_TELL", "these runs show none of the free parameters"
@@ -895,23 +900,24 @@ def _moves(trace: Trace) -> bool:
     return float(np.nanmax(trace.controlled) - np.nanmin(trace.controlled)) >= MOVING_RAM * trace.scale
 
 
-def _tell_nothing(model: Model, ranges: Sequence[Range], runs: Sequence[Trace], sources: Sequence[Source], fitted: int,
-                  floor: Mapping[str, float], reason: str, notes: Sequence[str]) -> Identification:
+def _tell_nothing(model: Model, ranges: Sequence[Range], runs: Sequence[Trace], sources: Sequence[Source],
+                  fitted_count: int, floor: Mapping[str, float], reason: str, notes: Sequence[str]) -> Identification:
     """The answer where no run to fit moves the ram."""
     estimates = tuple(Estimate(r.name, r.unit, model[r.name], r.low, r.high, r.centre, r.low, r.high, False, 1.0)
                       for r in ranges)
-    errors, residuals = measure_errors(model, model, runs, sources, fitted, floor)
+    errors, residuals = measure_errors(model, model, runs, sources, fitted_count, floor)
     advice = advise_experiments(model, list_unknowns(model, tuple(ranges)), make_problem(model, runs[:1], floor, 1),
                                 None, [r.name for r in ranges])
     return Identification("CANNOT_TELL", reason, model, model, estimates, None, (), tuple(advice), errors, floor,
                           tuple(runs), residuals, tuple(sources), tuple(notes))
 
 
-def write_identified_model(found: Identification, path: str | Path, command: str = "", date: str = "") -> Path | None:
+def write_identified_model(identification: Identification, path: str | Path, command: str = "", date: str = ""
+                           ) -> Path | None:
     """Write the model file; return where the file that was there before is now, None if there was none.
 
     Args:
-        found: the identification.
+        identification: of the actuator.
         path: the file.
         command: what the user typed.
         date: of today, as text.
@@ -919,20 +925,20 @@ def write_identified_model(found: Identification, path: str | Path, command: str
     Raises:
         InputError: a file that cannot be written.
     """
-    intervals = {e.name: Value(e.value, e.low, e.high, e.unit) for e in found.estimates if e.is_identifiable}
-    errors = found.errors
+    intervals = {e.name: Value(e.value, e.low, e.high, e.unit) for e in identification.estimates if e.is_identifiable}
+    errors = identification.errors
     origin: dict[str, str | list[str]] = {
-        "verdict": found.verdict, "date": date,
+        "verdict": identification.verdict, "date": date,
         "runs": [e.source.file for e in errors if not e.is_held_out],
         "runs_sha256": [e.source.sha256 for e in errors if not e.is_held_out],
         "holdouts": [e.source.file for e in errors if e.is_held_out],
         "holdouts_sha256": [e.source.sha256 for e in errors if e.is_held_out],
-        "not_identifiable": [e.name for e in found.estimates if not e.is_identifiable]}
-    known = Provenance(name_software(), (command,) if command else (), floor=found.floor, signals=tuple(found.floor),
-                       identification=origin)
-    unseen = {e.name: f"not identifiable from the runs, {e.low:.3g} .. {e.high:.3g}" for e in found.estimates
+        "not_identifiable": [e.name for e in identification.estimates if not e.is_identifiable]}
+    provenance = Provenance(name_software(), (command,) if command else (), floor=identification.floor,
+                            signals=tuple(identification.floor), identification=origin)
+    unseen = {e.name: f"not identifiable from the runs, {e.low:.3g} .. {e.high:.3g}" for e in identification.estimates
               if not e.is_identifiable}
-    return replace_text(path, format_model_file(found.model, intervals, known, unseen))
+    return replace_text(path, format_model_file(identification.model, intervals, provenance, unseen))
 
 
 class ControllerGains(NamedTuple):
@@ -950,8 +956,8 @@ class ControllerGains(NamedTuple):
     @property
     def values(self) -> Mapping[str, float]:
         """Parameters of the model, SI; none if this is not the law."""
-        found = {"controller.proportional_gain": self.gain, "controller.current_limit": self.limit}
-        return {name: value for name, value in found.items() if value is not None and self.is_proportional}
+        parameters = {"controller.proportional_gain": self.gain, "controller.current_limit": self.limit}
+        return {name: value for name, value in parameters.items() if value is not None and self.is_proportional}
 
 
 def read_controller(runs: Sequence[Trace], tolerance: float = 1e-3, fewest_rows: int = 20) -> ControllerGains | None:
@@ -964,16 +970,16 @@ def read_controller(runs: Sequence[Trace], tolerance: float = 1e-3, fewest_rows:
     """
     error = np.concatenate([t.command - t.controlled for t in runs])
     answer = np.concatenate([t.drive for t in runs])
-    known = np.isfinite(error) & np.isfinite(answer)
-    error, answer = error[known], answer[known]
+    is_known = np.isfinite(error) & np.isfinite(answer)
+    error, answer = error[is_known], answer[is_known]
     largest = float(np.abs(answer).max(initial=0.0))
-    inside = (np.abs(answer) < 0.99 * largest) & (np.abs(error) > 0.0) & (np.abs(answer) > 0.0)
-    if not inside.any():
+    is_inside = (np.abs(answer) < 0.99 * largest) & (np.abs(error) > 0.0) & (np.abs(answer) > 0.0)
+    if not is_inside.any():
         return None
-    ratio, weight = answer[inside] / error[inside], np.abs(error[inside])
+    ratio, weight = answer[is_inside] / error[is_inside], np.abs(error[is_inside])
     order = np.argsort(ratio)
     gain = float(ratio[order][np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())])  # weighted median
-    left = np.abs(answer - np.clip(gain * error, -largest, largest))
+    residual = np.abs(answer - np.clip(gain * error, -largest, largest))
     at_limit = int((np.abs(answer) > (1.0 - 1e-9) * largest).sum())
     return ControllerGains(gain, largest if at_limit >= fewest_rows else None,
-                           float((left <= tolerance * largest).mean()))
+                           float((residual <= tolerance * largest).mean()))
