@@ -92,7 +92,7 @@ def build_comparison_report(c: Comparison, next_command: str = "", files: Sequen
             if any(d.depends for d in c.diagnoses.values()) else []),
         Section("Refit within the tolerances", [_list_values(
             "change, in tolerances", {} if c.scatter is None else
-            {name: f"{moved:+.2f}" for name, moved in c.scatter.moved.items()},
+            {name: f"{shift:+.2f}" for name, shift in c.scatter.moved.items()},
             "How far each parameter moves when the model is refitted within the tolerances of a healthy unit.")],
             medium=Medium.PAGE),
         Section("Changes of the model", [_list_values(
@@ -117,9 +117,9 @@ def describe_verdict(c: Comparison) -> str:
 
 
 def _error_and_floor(s: SignalError) -> str:
-    bound = "at least " if s.floor.lower_bound else ""
+    prefix = "at least " if s.floor.lower_bound else ""
     return (f"{s.signal.symbol} error {format_amount(s.error, s.signal.unit)}, "
-            f"noise floor {bound}{format_amount(s.floor.value, s.signal.unit)}")
+            f"noise floor {prefix}{format_amount(s.floor.value, s.signal.unit)}")
 
 
 def _describe_blocks(c: Comparison) -> str:
@@ -131,10 +131,10 @@ def _describe_blocks(c: Comparison) -> str:
         names[names.index("jack")] = "jack or the sensor"
         names.remove("sensor")
     less = f", the {' and the '.join(names[1:])} less" if names[1:] else ""
-    found = f"the {names[0]} disagree{'' if ' or ' in names[0] else 's'}{less}"
+    text = f"the {names[0]} disagree{'' if ' or ' in names[0] else 's'}{less}"
     fits = [name for name, ratio in c.blocks.items() if ratio is not None and name not in c.named]
     verb = "fits" if len(fits) == 1 else "fit"
-    return f"{found}; {join_words(fits)} {verb}" if fits else found
+    return f"{text}; {join_words(fits)} {verb}" if fits else text
 
 
 def _tabulate_signals(c: Comparison) -> Table:
@@ -191,14 +191,14 @@ def describe_block(c: Comparison, name: str) -> str:
     if not c.model.kind.balances:
         return "the signal with the largest ratio" if name == "plant" else "cannot be told from the plant"
     path = INPUTS_OF_BLOCKS[name]
-    measured = [s.signal.symbol for s in reversed([*c.signals.values()]) if s.signal != c.trace.declared.controlled]
+    symbols = [s.signal.symbol for s in reversed([*c.signals.values()]) if s.signal != c.trace.declared.controlled]
     if c.blocks[name] is None:
         needs = {(): "needs XS or P12", ("P12",): "needs XS", ("XS",): "needs P12"}
-        return f"{path}: {needs.get(tuple(measured), 'too little data')}"
-    if name == "servovalve" and "XS" not in measured:
+        return f"{path}: {needs.get(tuple(symbols), 'too little data')}"
+    if name == "servovalve" and "XS" not in symbols:
         return "Cor to flow, as XS was not measured"
-    if name == "jack" and len(measured) == 1:
-        return f"{measured[0]} to the ram: {'flow' if measured == ['XS'] else 'forces'}"
+    if name == "jack" and len(symbols) == 1:
+        return f"{symbols[0]} to the ram: {'flow' if symbols == ['XS'] else 'forces'}"
     flow, force = c.parts["flow"], c.parts["force"]
     return path if name != "jack" or flow is None or force is None else (
         f"{path}: flow {format_ratio(flow)}, forces {format_ratio(force)}")
@@ -206,8 +206,8 @@ def describe_block(c: Comparison, name: str) -> str:
 
 def _describe_controller(c: Comparison) -> str:
     d, a = c.trace.declared, c.answer
-    late = ((d.command.symbol, a.com_lag), (d.controlled.symbol, a.xj_lag))
-    lags = [f"{symbol} {count_nouns(lag, 'cycle')} earlier" for symbol, lag in late if lag > 0]
+    delays = ((d.command.symbol, a.com_lag), (d.controlled.symbol, a.xj_lag))
+    lags = [f"{symbol} {count_nouns(lag, 'cycle')} earlier" for symbol, lag in delays if lag > 0]
     path = f"{d.command.symbol} and {d.controlled.symbol} to {d.drive.symbol}" + (
         f" (from {' and '.join(lags)})" if lags else "")
     if not c.model.kind.controller:
@@ -217,11 +217,11 @@ def _describe_controller(c: Comparison) -> str:
         return f"{path}: its law {'remembers what is not in the log' if is_read else 'needs unknown readings'}"
     if a.ratio <= CONTROLLER_ERROR_RATIO:
         return f"{path}: equal to the last digit"
-    factor, shown = (1e6, "uA") if d.drive.unit == "A" else (1.0, d.drive.unit)
-    gain, unit = find_controller_gain(c.model, c.trace.period)[0], f"{d.drive.unit}/{d.controlled.unit}"
+    factor, error_unit = (1e6, "uA") if d.drive.unit == "A" else (1.0, d.drive.unit)
+    gain, gain_unit = find_controller_gain(c.model, c.trace.period)[0], f"{d.drive.unit}/{d.controlled.unit}"
     is_off = math.isfinite(a.gain) and abs(a.gain - gain) > 0.002 * gain
-    return (f"{path}: error {factor * a.error:.3g} {shown} RMS, floor {factor * a.floor:.3g} {shown}"
-            + (f"; its gain is {a.gain:.4g} {unit}, the model's {gain:.4g} {unit}" if is_off else ""))
+    return (f"{path}: error {factor * a.error:.3g} {error_unit} RMS, floor {factor * a.floor:.3g} {error_unit}"
+            + (f"; its gain is {a.gain:.4g} {gain_unit}, the model's {gain:.4g} {gain_unit}" if is_off else ""))
 
 
 def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6) -> list[Line]:
@@ -286,8 +286,8 @@ def _describe_scatter(c: Comparison) -> str:
     if s is None:
         return ""
     if s.enough:
-        changed = [f"{name} by {moved:+.1f}" for name, moved in s.moved.items() if abs(moved) > 1.0][:2]
-        which = f" (in tolerances: {', '.join(changed)})" if changed else ""
+        changes = [f"{name} by {shift:+.1f}" for name, shift in s.moved.items() if abs(shift) > 1.0][:2]
+        which = f" (in tolerances: {', '.join(changes)})" if changes else ""
         return f"tolerances of the parameters could explain all of the error{which}"
     worst = max(s.ratio, key=lambda name: s.ratio[name])
     signal = c.signals[worst].signal
@@ -301,18 +301,18 @@ def _describe_residual(signal: Signal, d: ResidualTests, strong: float = 0.15, l
 
     A correlation below `strong` explains 2 % of the power or less; `long_memory` is in memories of the noise.
     """
-    found = []
+    parts = []
     if d.memory > long_memory * d.noise_memory:
-        found.append(f"keeps its sign for {1e3 * d.memory:.0f} ms (noise: {1e3 * d.noise_memory:.0f} ms), "
+        parts.append(f"keeps its sign for {1e3 * d.memory:.0f} ms (noise: {1e3 * d.noise_memory:.0f} ms), "
                      f"half of its power is below {d.half_power:.2g} Hz")
-    if followed := [f for f in d.follows if abs(f.correlation) > max(strong, 2 * f.bound)]:
-        f = max(followed, key=lambda f: abs(f.correlation))
-        found.append(f"follows {f.input} by {1e3 * f.lag:.3g} ms (correlation {f.correlation:.2f})")
+    if inputs := [f for f in d.follows if abs(f.correlation) > max(strong, 2 * f.bound)]:
+        f = max(inputs, key=lambda f: abs(f.correlation))
+        parts.append(f"follows {f.input} by {1e3 * f.lag:.3g} ms (correlation {f.correlation:.2f})")
     if d.depends and d.depends[0].share > DEPENDENCE_SHARE:
         first = d.depends[0]
-        found.append(f"{format_percent(first.share)} of its power depends on {first.on}{SHAPE_WORDS[first.shape]}, "
+        parts.append(f"{format_percent(first.share)} of its power depends on {first.on}{SHAPE_WORDS[first.shape]}, "
                      f"up to {format_amount(abs(first.size), signal.unit)}")
-    return f"{signal.symbol}: {'; '.join(found)}" if found else ""
+    return f"{signal.symbol}: {'; '.join(parts)}" if parts else ""
 
 
 def collect_data(c: Comparison) -> dict[str, Any]:
@@ -359,21 +359,21 @@ def draw_overview(c: Comparison) -> str:
     """Command and position, then each signal measured and replayed, and its residual beside the noise floor."""
     t = c.trace.t
     ends = np.flatnonzero(np.diff((c.replay.undecided | ~c.trace.usable).astype(int), prepend=0, append=0))
-    left_out = [shade(float(t[a]), float(t[b - 1]), RED, 0.12) for a, b in ends.reshape(-1, 2)]
+    shades = [shade(float(t[a]), float(t[b - 1]), RED, 0.12) for a, b in ends.reshape(-1, 2)]
     d = c.trace.declared
     command, controlled = d.command, d.controlled
     panels: list[Panel] = [[line(t, c.trace.command * command.shown_scale, COMMAND, f"{command.symbol}, command", 2.2),
                             line(t, c.trace.controlled * controlled.shown_scale, BLUE,
                                  f"{controlled.symbol}, {controlled.phrase}"),
-                            axes(ylabel=f"{name_controlled(d)} [{controlled.shown_unit}]"), legend(2), *left_out]]
+                            axes(ylabel=f"{name_controlled(d)} [{controlled.shown_unit}]"), legend(2), *shades]]
     for name, s in c.signals.items():
         scale, (fine, small) = s.signal.shown_scale, choose_drawn_unit(s.signal, s.error)
         floor = NOISE_BAND_RATIO * s.floor.value * small
         panels += [[line(t, c.trace.mask_unusable(name) * scale, choose_colour(d, name), "measured", 1.2),
                     line(t, c.replay.model[name] * scale, ORANGE, f"model, from the {d.drive.phrase}", 0.8),
-                    axes(ylabel=label_signal(s.signal)), legend(2), *left_out],
+                    axes(ylabel=label_signal(s.signal)), legend(2), *shades],
                    [band(-floor, floor, GREEN), line(t, c.replay.residual[name] * small, INK, width=0.7),
-                    axes(ylabel=f"residual of\n{s.signal.symbol} [{fine}]"), *left_out]]
+                    axes(ylabel=f"residual of\n{s.signal.symbol} [{fine}]"), *shades]]
     return draw_over_time("overview", c.trace, panels, [1.5] + [1.3, 1.3] * len(c.signals))
 
 
@@ -395,14 +395,14 @@ def draw_deviation_map(c: Comparison) -> str:
     from matplotlib.colors import LogNorm
 
     floor = {name: s.floor.value for name, s in c.signals.items() if s.floor.value > 0.0}
-    found = map_deviation(c.trace, {name: c.replay.residual[name] for name in floor}, floor) if floor else None
-    if found is None:
+    deviations = map_deviation(c.trace, {name: c.replay.residual[name] for name in floor}, floor) if floor else None
+    if deviations is None:
         return ""
     controlled = c.trace.declared.controlled
     unit = controlled.shown_unit
-    norm = LogNorm(1.0, max(10.0, *(float(np.nanmax(ratio)) for ratio in found.ratio.values())))
+    norm = LogNorm(1.0, max(10.0, *(float(np.nanmax(ratio)) for ratio in deviations.ratio.values())))
     speeds, amplitudes = ([["" if np.isinf(edge) else f"{controlled.shown_scale * edge:g}" for edge in edges]
-                           for edges in (found.speeds, found.amplitudes)])
+                           for edges in (deviations.speeds, deviations.amplitudes)])
     return draw_panels("map", [[[
         call("pcolormesh", np.ma.masked_invalid(ratio), cmap="YlOrRd", norm=norm, edgecolors="white", linewidth=1.0),
         *(call("text", column + 0.5, row + 0.5, format_ratio(float(value)), ha="center", va="center", fontsize=8,
@@ -411,8 +411,8 @@ def draw_deviation_map(c: Comparison) -> str:
         call("set_xticks", range(len(speeds)), speeds), call("set_yticks", range(len(amplitudes)), amplitudes),
         axes(title=c.signals[name].signal.symbol, xlabel=f"speed [{unit}/s]",
              ylabel="" if number else f"amplitude [{unit}]"),
-        call("grid", False)] for number, (name, ratio) in enumerate(found.ratio.items())]],
-        1.2 + 0.42 * len(found.amplitudes), sharey=True)
+        call("grid", False)] for number, (name, ratio) in enumerate(deviations.ratio.items())]],
+        1.2 + 0.42 * len(deviations.amplitudes), sharey=True)
 
 
 def draw_whiteness(c: Comparison) -> str:
@@ -424,15 +424,17 @@ def draw_whiteness(c: Comparison) -> str:
 
 def _draw_tests(d: ResidualTests, period: float, label: str, drive: str) -> list[Panel]:
     rise = np.linspace(0.0, 1.0, len(d.frequencies))
-    chosen = next((f for f in d.follows if f.input == drive), d.follows[0] if d.follows else None)
+    cross_correlation = next((f for f in d.follows if f.input == drive), d.follows[0] if d.follows else None)
     return [
         [*_draw_correlation(np.arange(1, len(d.correlation)) * period, d.correlation[1:], d.band),
          axes(ylabel=f"{label}\nautocorrelation", xlabel="lag [ms]")],
         [area(d.frequencies, rise - d.allowed, rise + d.allowed, GREEN), line(d.frequencies, d.power, INK),
          axes(ylim=(0, 1), ylabel="cumulative power", xlabel="frequency [Hz]")],
-        [] if chosen is None else
-        [*_draw_correlation(chosen.lags, chosen.curve, chosen.bound), instant(0.0, COMMAND, width=0.6),
-         axes(ylabel=f"correlation with {chosen.input}", xlabel=f"residual later than {chosen.input} by [ms]")]]
+        [] if cross_correlation is None else
+        [*_draw_correlation(cross_correlation.lags, cross_correlation.curve, cross_correlation.bound),
+         instant(0.0, COMMAND, width=0.6),
+         axes(ylabel=f"correlation with {cross_correlation.input}",
+              xlabel=f"residual later than {cross_correlation.input} by [ms]")]]
 
 
 def _draw_correlation(lags: Any, values: Any, bound: float) -> list[Mark]:
@@ -443,10 +445,11 @@ def draw_dependence(c: Comparison) -> str:
     """One row per signal: mean residual over motion and other outputs, with 95 % intervals."""
     by = {name: {x.on: x for x in d.depends} for name, d in c.diagnoses.items()}
     possible = ("speed", "position", *(s.symbol for s in c.trace.declared.outputs), "acceleration")
-    kinds = [kind for kind in possible if any(kind in own for own in by.values())]
+    kinds = [kind for kind in possible if any(kind in dependences for dependences in by.values())]
     if not kinds:
         return ""
-    return draw_panels("dependence", [_draw_means(c, name, kinds, own) for name, own in by.items()], 2.3 * len(by))
+    return draw_panels("dependence", [_draw_means(c, name, kinds, dependences) for name, dependences in by.items()],
+                       2.3 * len(by))
 
 
 def _draw_means(c: Comparison, name: str, kinds: Sequence[str], by: dict[str, Depends]) -> list[Panel]:

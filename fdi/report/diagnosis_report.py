@@ -119,10 +119,10 @@ def build_diagnosis_report(d: Diagnosis) -> Report:
 def build_bands_report(bands: Bands, place: str) -> Report:
     """Report on bands that `rig fdi --learn-bands` wrote to this place."""
     judges = [fault.name for fault in bands.faults if bands.shows(fault)]
-    judged = join_words(name.replace("_", " ") for name in judges)
+    fault_names = join_words(name.replace("_", " ") for name in judges)
     return Report(
         command="fdi", title=place, files=[("bands", place)],
-        sentence=f"The bands judge {judged}." if judged else
+        sentence=f"The bands judge {fault_names}." if fault_names else
         "The bands judge none of the faults: their responses are within the scatter of healthy units.",
         sections=[Section("Provenance", [Line(label, str(text)) for label, text in bands.provenance.items()])],
         data={"bands": place, "judges": judges, "provenance": dict(bands.provenance)})
@@ -130,17 +130,18 @@ def build_bands_report(bands: Bands, place: str) -> Report:
 
 def describe_verdict(d: Diagnosis) -> str:
     """The verdict in a sentence or two."""
-    whole, each = ("neither fault", "the two faults") if len(d.faults) == 2 else ("no fault", "the faults")
-    grouped = {name for group in d.groups for name in group}
-    names = join_words(f.title for f in d.faults if d.levels[f.name] is None and f.name not in grouped)
+    no_fault, the_faults = ("neither fault", "the two faults") if len(d.faults) == 2 else ("no fault", "the faults")
+    grouped_names = {name for group in d.groups for name in group}
+    names = join_words(f.title for f in d.faults if d.levels[f.name] is None and f.name not in grouped_names)
     is_disputed = d.beside is not None and d.beside.disputed
     groups = " ".join(describe_group(d, group) for group in d.groups)
     match d.verdict:
         case "SOMETHING_ELSE" if d.beside is not None:
-            return (f"Neither {each} nor they and other effects of the catalogue explain this trace: the residual "
-                    f"of the best fit is {describe_residual(d)}. No fault is reported until the cause is known.")
+            return (f"Neither {the_faults} nor they and other effects of the catalogue explain this trace: the "
+                    f"residual of the best fit is {describe_residual(d)}. No fault is reported until the cause is "
+                    "known.")
         case "SOMETHING_ELSE":
-            return (f"{whole.capitalize()} explains this trace: the residual of the best fit is "
+            return (f"{no_fault.capitalize()} explains this trace: the residual of the best fit is "
                     f"{describe_residual(d)}. Something else is wrong; no fault is reported until the cause is known. "
                     "rig fdi --with-effects searches for the cause and sizes "
                     f"{'both' if len(d.faults) == 2 else 'the'} faults beside it.")
@@ -173,11 +174,11 @@ def _describe_rest(d: Diagnosis, worst: Fault) -> str:
     """The levels of the faults that do not rule; of many, those that are not acceptable, and how many are."""
     rest = {fault: d.levels[fault.name] for fault in d.faults if fault != worst}
     many = [fault for fault, level in rest.items() if level == Level.ACCEPTABLE]
-    said = [f"{fault.title} {'' if level is None else 'is '}{LEVEL_NAMES[level]}"
-            for fault, level in rest.items() if len(rest) == 1 or fault not in many]
+    parts = [f"{fault.title} {'' if level is None else 'is '}{LEVEL_NAMES[level]}"
+             for fault, level in rest.items() if len(rest) == 1 or fault not in many]
     if many and len(rest) > 1:
-        said.append(f"{many[0].title} is acceptable" if len(many) == 1 else f"{len(many)} other faults are acceptable")
-    return "; ".join(said)
+        parts.append(f"{many[0].title} is acceptable" if len(many) == 1 else f"{len(many)} other faults are acceptable")
+    return "; ".join(parts)
 
 
 def describe_group(d: Diagnosis, group: Group) -> str:
@@ -253,15 +254,15 @@ def list_overruled(d: Diagnosis, far: float = 2.0) -> Iterator[str]:
     beside = f", beside {_list_others(d)}" if d.others else ""
     trust = "Trust the fit" if d.refinement.is_explained else "The fit does not explain the trace either"
     for fault in d.faults:
-        size, level, said = d.sizes[fault.name], d.levels[fault.name], []
+        size, level, objections = d.sizes[fault.name], d.levels[fault.name], []
         if level is not None and by_bands.get(fault.name, level) > level:
-            said.append(f"the bands call it {LEVEL_NAMES[by_bands[fault.name]]}")
+            objections.append(f"the bands call it {LEVEL_NAMES[by_bands[fault.name]]}")
         if (grid := _find_grid(d.grids, fault)) is not None:
-            found, axis = grid.find_size(fault, grid.merged), grid.axes[grid.faults.index(fault)]
-            if max(size.low - found, found - size.high) > far * float(axis[1] - axis[0]):
-                said.append(f"the grid gives {format_amount(found, fault.unit)}")
-        if said:
-            yield (f"{fault.title}: {' and '.join(said)}; the fit, which alone models the whole plant, finds "
+            grid_size, axis = grid.find_size(fault, grid.merged), grid.axes[grid.faults.index(fault)]
+            if max(size.low - grid_size, grid_size - size.high) > far * float(axis[1] - axis[0]):
+                objections.append(f"the grid gives {format_amount(grid_size, fault.unit)}")
+        if objections:
+            yield (f"{fault.title}: {' and '.join(objections)}; the fit, which alone models the whole plant, finds "
                    f"{fault.symbol} {format_interval(*size, fault.unit)}{beside}. {trust}.")
 
 
@@ -277,8 +278,8 @@ def _list_others(d: Diagnosis) -> str:
 def _join_alternatives(b: Beside) -> str:
     """Effects beside the faults: those of one explanation by "and", explanations that fit equally well by "or"."""
     marks = join_words(b.marks)
-    found = " or ".join(name_explanation(e) for e in b.explanations if e.effects or not marks)
-    return f"{marks} and {found}" if marks and any(e.effects for e in b.explanations) else marks or found
+    alternatives = " or ".join(name_explanation(e) for e in b.explanations if e.effects or not marks)
+    return f"{marks} and {alternatives}" if marks and any(e.effects for e in b.explanations) else marks or alternatives
 
 
 def name_explanation(e: Explanation) -> str:
@@ -347,8 +348,8 @@ def _show_effects(d: Diagnosis) -> list[Item]:
         *(column for fault in d.faults for column in show_fault(fault)),
         (Column("residual / noise", align="right", medium=Medium.PAGE),
          lambda e: format_ratio(max(e.refinement.ratio.values()))), caption=caption),
-            *(Line(effect, f"{_format_parameters(own)}, read off without noise")
-              for effect, own in b.marks.items()),
+            *(Line(effect, f"{_format_parameters(sizes)}, read off without noise")
+              for effect, sizes in b.marks.items()),
             *(Paragraph(f"The level of {fault.title} depends on which of these is right: cannot be judged.")
               for fault in d.faults if fault.name in b.disputed)]
 
@@ -358,28 +359,28 @@ def _format_parameters(sizes: Mapping[str, Value]) -> str:
 
 
 def _show_bands(d: Diagnosis) -> list[Item]:
-    judged, bands = d.band_verdict, d.bands
-    if judged is None or bands is None:
+    band_verdict, bands = d.band_verdict, d.bands
+    if band_verdict is None or bands is None:
         return []
-    at_steps, at_ramps = (_choose_drawn_fault(d, bands, judged, kind) for kind in ("step", "ramp"))
-    allowed = " with the friction that the ramps show" if judged.shown else ""
+    at_steps, at_ramps = (_choose_drawn_fault(d, bands, band_verdict, kind) for kind in ("step", "ramp"))
+    friction = " with the friction that the ramps show" if band_verdict.shown else ""
     return [Figure("Command and position. Shaded: times outside MidBand (amber) and MaxBand (red).",
-                   partial(draw_overview, d.trace, judged)),
-            *([Figure(f"Steps judge {_title(d, at_steps.name)}: measured position less that of a healthy unit{allowed}."
-                      " Green: scatter of healthy units; amber and red: limits, drawn where the fault is "
-                      "distinguishable from it.", partial(draw_steps, d.trace, bands, judged, at_steps))]
+                   partial(draw_overview, d.trace, band_verdict)),
+            *([Figure(f"Steps judge {_title(d, at_steps.name)}: measured position less that of a healthy unit{friction}"
+                      ". Green: scatter of healthy units; amber and red: limits, drawn where the fault is "
+                      "distinguishable from it.", partial(draw_steps, d.trace, bands, band_verdict, at_steps))]
               if at_steps else []),
             *([Figure(f"Ramps judge {_title(d, at_ramps.name)}: following error (top) and speed beyond the demand "
                       "(bottom). Green: scatter of healthy units; amber and red: limits.",
-                      partial(draw_ramps, d.trace, bands, judged, at_ramps))] if at_ramps else [])]
+                      partial(draw_ramps, d.trace, bands, band_verdict, at_ramps))] if at_ramps else [])]
 
 
-def _choose_drawn_fault(d: Diagnosis, bands: Bands, judged: BandVerdict, kind: str) -> BandFault | None:
+def _choose_drawn_fault(d: Diagnosis, bands: Bands, band_verdict: BandVerdict, kind: str) -> BandFault | None:
     """Of the faults that sections of a kind judge, the one that is furthest in its bands."""
-    drawn = ({r.fault for r in bands.ramps if math.isfinite(r.position.middle)} if kind == "ramp" else
+    names = ({r.fault for r in bands.ramps if math.isfinite(r.position.middle)} if kind == "ramp" else
              {name for s in bands.steps for name in s.middle})
-    own = [fault for fault in bands.faults if fault.name in drawn]
-    return max(own, key=lambda f: (f.name in d.levels, judged.severity.get(f.name, -1.0)), default=None)
+    faults = [fault for fault in bands.faults if fault.name in names]
+    return max(faults, key=lambda f: (f.name in d.levels, band_verdict.severity.get(f.name, -1.0)), default=None)
 
 
 def _title(d: Diagnosis, fault: str) -> str:
@@ -419,18 +420,18 @@ def _group_events(events: Sequence[Event], apart: float = 0.5) -> list[list[Even
     """
     groups: list[list[Event]] = []
     for event in events:
-        own = next((group for group in reversed(groups) if group[-1][:4] == event[:4]), None)
-        if own is None or event.t_in - own[-1].t_out > apart:
+        last_group = next((group for group in reversed(groups) if group[-1][:4] == event[:4]), None)
+        if last_group is None or event.t_in - last_group[-1].t_out > apart:
             groups.append([event])
         else:
-            own.append(event)
+            last_group.append(event)
     return groups
 
 
 def _show_maps(grid: Grid) -> list[Item]:
-    found = (("steps, A", grid.step), ("ramps, B", grid.ramp), ("both, C", grid.joint))
+    maps = (("steps, A", grid.step), ("ramps, B", grid.ramp), ("both, C", grid.joint))
     points: list[tuple[str, Point | Merged]] = [
-        *((name, m.minimum) for name, m in found if m),
+        *((name, m.minimum) for name, m in maps if m),
         (f"centre of gravity, G ({100 * grid.merged.weight:.0f} % of A)", grid.merged)]
     first, second = grid.faults
     return [Figure(f"{first.title.capitalize()} and {second.title}: RMS difference between the measured position and "
@@ -452,27 +453,28 @@ def _show_precursors(d: Diagnosis) -> list[Item]:
     def show_deviation(x: float) -> str:
         return f"{round(x, 1) + 0.0:+.1f}" if math.isfinite(x) else NO_NUMBER  # + 0.0: not "-0.0"
 
-    found, number = d.precursors, partial(Column, unit="", align="right", medium=Medium.PAGE)
+    precursors, number = d.precursors, partial(Column, unit="", align="right", medium=Medium.PAGE)
 
     def show_value(title: str, find_value: Callable[[Precursor], float]) -> tuple[Column, Callable[[str], Cell | str]]:
-        return number(title), lambda name: format_precursor(find_value(found[name]), name, found[name].unit)
+        return number(title), lambda name: format_precursor(find_value(precursors[name]), name, precursors[name].unit)
 
     def show_fault(fault: BandFault) -> list[tuple[Column, Callable[[str], Cell | str]]]:
         title = f"{fault.symbol} {format_limit(fault.acceptable, fault.unit)} adds"  # MidBand
 
         def ratio(name: str) -> Cell | str:
-            return show_deviation(found[name].compute_ratio(fault.name))
+            return show_deviation(precursors[name].compute_ratio(fault.name))
 
         # of many faults there is no room for both
         return [(number(title, unit="s.d."), ratio)] if d.bands and len(d.bands.faults) > 2 else [
             show_value(title, lambda p: p.adds.get(fault.name, math.nan)), (number("in s.d."), ratio)]
 
     return [tabulate(
-        found, (Column("precursor"), lambda name: found[name].words),
-        (Column("measured", align="right"), lambda name: Cell(found[name].shown, is_strong=True)),
+        precursors, (Column("precursor"), lambda name: precursors[name].words),
+        (Column("measured", align="right"), lambda name: Cell(precursors[name].shown, is_strong=True)),
         *((show_value("healthy", lambda p: p.healthy), show_value("healthy s.d.", lambda p: p.noise),
            (Column("deviation", "s.d.", "right"), lambda name: Cell(
-               show_deviation(found[name].departure), "bad" if 4.0 < abs(found[name].departure) < math.inf else "")),
+               show_deviation(precursors[name].departure),
+               "bad" if 4.0 < abs(precursors[name].departure) < math.inf else "")),
            *(column for fault in d.bands.faults for column in show_fault(fault))) if d.bands else ()),
         caption="Deviation: measured minus healthy mean, in standard deviations of healthy units; red beyond 4."
         if d.bands else "As measured; without bands there are no healthy units to compare with.")]
@@ -510,7 +512,7 @@ def _collect_grid(g: Grid) -> dict[str, Any]:
         return sizes | {key: x for key, x in point._asdict().items() if key != "sizes"}
 
     maps = (("step", g.step), ("ramp", g.ramp), ("joint", g.joint))
-    return {**{name: None if found is None else collect(found.minimum) for name, found in maps},
+    return {**{name: None if grid_map is None else collect(grid_map.minimum) for name, grid_map in maps},
             "merged": collect(g.merged), "simulations": g.simulations}
 
 
@@ -524,7 +526,7 @@ def _collect_beside(d: Diagnosis, b: Beside) -> dict[str, Any]:
     return {
         "effects": list(b.effects), "explained": b.is_explained, "ambiguous": b.is_ambiguous,
         "disputed": list(b.disputed),
-        "marks": {effect: {name: e._asdict() for name, e in own.items()} for effect, own in b.marks.items()},
+        "marks": {effect: {name: e._asdict() for name, e in sizes.items()} for effect, sizes in b.marks.items()},
         "explanations": [
             {"effects": list(e.effects), "probability": e.weight,
              "parameters": {name: v._asdict() for name, v in e.parameters.items()},
@@ -540,7 +542,7 @@ MAP_CONTOURS = 7
 MS = 1e3
 
 
-def draw_overview(trace: Trace, judged: BandVerdict) -> str:
+def draw_overview(trace: Trace, band_verdict: BandVerdict) -> str:
     """Command and position of the whole trace, times outside the bands shaded."""
     limits = (float(trace.t[0]), float(trace.t[-1]) + trace.period)
     command, controlled = trace.declared.command, trace.declared.controlled
@@ -548,14 +550,14 @@ def draw_overview(trace: Trace, judged: BandVerdict) -> str:
     return draw_panels("overview", [[[
         line(trace.t, trace.command * scale, COMMAND, f"{command.symbol}, command", 2.2),
         line(trace.t, trace.mask_unusable(controlled.name) * scale, BLUE, f"{controlled.symbol}, measured"),
-        *_shade_events(judged.events, limits),
+        *_shade_events(band_verdict.events, limits),
         axes(xlim=limits, ylabel=f"{controlled.symbol} [{unit}]", xlabel="time [s]"), legend(2)]]], 2.4)
 
 
-def draw_steps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault) -> str:
+def draw_steps(trace: Trace, bands: Bands, band_verdict: BandVerdict, fault: BandFault) -> str:
     """Each step as it judges a fault: position less the healthy response, scatter of healthy units, limits, events."""
     place = _find_sections(trace, bands)
-    panels: list[Panel] = [_draw_step(trace, bands, step, place[step.section], judged, fault)
+    panels: list[Panel] = [_draw_step(trace, bands, step, place[step.section], band_verdict, fault)
                            for step in bands.steps if fault.name in step.middle]
     across = min(2, len(panels))
     panels += [[]] * (-len(panels) % across)
@@ -563,19 +565,19 @@ def draw_steps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault
     return draw_panels("steps", rows, 2.5 * len(rows), common_legend=True)
 
 
-def _draw_step(trace: Trace, bands: Bands, step: StepBand, s: CommandSection, judged: BandVerdict, fault: BandFault
-               ) -> Panel:
+def _draw_step(trace: Trace, bands: Bands, step: StepBand, s: CommandSection, band_verdict: BandVerdict,
+               fault: BandFault) -> Panel:
     controlled = trace.declared.controlled
     fine, small = choose_unit(controlled.unit, 0.0)
     t, begin, side = step.t * MS, float(trace.t[s.start]), np.sign(step.middle[fault.name])
-    centre, spread = step.compute_centres(judged.shown, bands)[0]
-    middle, most, there = step.compute_margins(fault, spread)
+    centre, spread = step.compute_centres(band_verdict.shown, bands)[0]
+    middle, most, is_judged = step.compute_margins(fault, spread)
     rows = np.minimum(s.start + np.rint(step.t / trace.period).astype(int), s.stop - 1)
     healthy = BAND_NEAREST_LIMIT_SD * spread / fine
-    events = [e for e in judged.events if e.fault == fault.name]
+    events = [e for e in band_verdict.events if e.fault == fault.name]
     title = f"step of {(s.last - s.first) * controlled.shown_scale:+.3g} {controlled.shown_unit} at {begin:.4g} s"
     return [area(t, -healthy, healthy, GREEN, "healthy", 0.15),
-            *(line(t, np.where(there, side * limit, np.nan) / fine, colour, label, 1.6)
+            *(line(t, np.where(is_judged, side * limit, np.nan) / fine, colour, label, 1.6)
               for limit, colour, label in ((middle, ORANGE, "MidBand"), (most, RED, "MaxBand"))),
             line(t, (trace.mask_unusable(controlled.name)[rows] - centre) / fine, INK, "measured"),
             *_shade_events(events, (0.0, float(t[-1])), "position", MS, begin),
@@ -583,18 +585,20 @@ def _draw_step(trace: Trace, bands: Bands, step: StepBand, s: CommandSection, ju
                  ylabel=f"off the healthy\nresponse [{small}]")]
 
 
-def draw_ramps(trace: Trace, bands: Bands, judged: BandVerdict, fault: BandFault) -> str:
+def draw_ramps(trace: Trace, bands: Bands, band_verdict: BandVerdict, fault: BandFault) -> str:
     """Each ramp as it judges a fault: following error and speed within their limits, and events."""
     place = _find_sections(trace, bands)
-    own = [ramp for ramp in bands.ramps if ramp.fault == fault.name]
-    pairs = [[*_draw_ramp(trace, ramp, place[ramp.section], judged, number == 0)] for number, ramp in enumerate(own)]
+    ramps = [ramp for ramp in bands.ramps if ramp.fault == fault.name]
+    pairs = [[*_draw_ramp(trace, ramp, place[ramp.section], band_verdict, number == 0)]
+             for number, ramp in enumerate(ramps)]
     return draw_panels("ramps", list(zip(*pairs, strict=True)), 4.6, common_legend=True, sharex="col", sharey="row")
 
 
-def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, judged: BandVerdict, is_first: bool) -> Iterator[Panel]:
+def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, band_verdict: BandVerdict, is_first: bool
+               ) -> Iterator[Panel]:
     rows, controlled = select_ramp_rows(s, trace.period), trace.declared.controlled
     speed, (fine, small) = f"{controlled.shown_unit}/s", choose_unit(controlled.unit, 0.0)
-    events = [e for e in judged.events if e.fault == ramp.fault]
+    events = [e for e in band_verdict.events if e.fault == ramp.fault]
     error, fast = measure_ramp(trace.mask_unusable(controlled.name), trace.command, s, trace.period)
     scale = ramp.compute_scale(float(compute_half_range(error)), float(find_lasting_peak(fast)))
     limits = (float(trace.t[rows.start]), float(trace.t[rows.stop - 1]))
@@ -622,30 +626,30 @@ def _shade_events(events: Sequence[Event], limits: tuple[float, float], signal: 
                   begin: float = 0.0) -> list[Mark]:
     """The times outside over the whole height; `limits` are those of the panel, in `unit` from `begin`."""
     ends = [(e.band, (e.t_in - begin) * unit, (e.t_out - begin) * unit) for e in events if signal in ("", e.signal)]
-    return [spans([(a, b) for name, a, b in ends if name == shown and b > limits[0] and a < limits[1]], colour,
-                  alpha=0.18, lw=0, zorder=-1) for shown, colour in SHADES.items()]
+    return [spans([(a, b) for name, a, b in ends if name == band_name and b > limits[0] and a < limits[1]], colour,
+                  alpha=0.18, lw=0, zorder=-1) for band_name, colour in SHADES.items()]
 
 
 def draw_sizes(faults: Sequence[Fault], sizes: Mapping[str, Estimate], grids: Sequence[Grid] = (),
-               judged: BandVerdict | None = None) -> str:
+               band_verdict: BandVerdict | None = None) -> str:
     """The faults' sizes: refined with its interval, grid, and what the ramps show, over the three levels."""
     panels = []
     for fault in faults:
-        found = []
+        other_sizes = []
         if (grid := _find_grid(grids, fault)) is not None:
             points = (("grid, merged", grid.merged), ("grid, steps", grid.step and grid.step.minimum),
                       ("grid, ramps", grid.ramp and grid.ramp.minimum))
-            found += [(label, grid.find_size(fault, point)) for label, point in points if point]
-        if judged is not None and fault.name in judged.shown:
-            found.append(("bands, ramps", judged.shown[fault.name][0]))
-        panels.append(_draw_sizes_of_fault(fault, sizes[fault.name], found))
+            other_sizes += [(label, grid.find_size(fault, point)) for label, point in points if point]
+        if band_verdict is not None and fault.name in band_verdict.shown:
+            other_sizes.append(("bands, ramps", band_verdict.shown[fault.name][0]))
+        panels.append(_draw_sizes_of_fault(fault, sizes[fault.name], other_sizes))
     panels += [[]] * (-len(panels) % 2)
     return draw_panels("estimates", [panels[i:i + 2] for i in range(0, len(panels), 2)], 1.9 * ((len(panels) + 1) // 2))
 
 
-def _draw_sizes_of_fault(fault: Fault, fit: Estimate, found: Sequence[tuple[str, float]]) -> Panel:
+def _draw_sizes_of_fault(fault: Fault, fit: Estimate, other_sizes: Sequence[tuple[str, float]]) -> Panel:
     _, middle, most = fault.limits
-    reach = [fit.low, fit.high, *(size for _, size in found)]
+    reach = [fit.low, fit.high, *(size for _, size in other_sizes)]
     end = max(most / 0.7, *(1.05 * fault.measure_departure(size) for size in reach))
     interval = [[max(fit.value - fit.low, 0.0)], [max(fit.high - fit.value, 0.0)]]
     ways = (-1.0, 1.0) if fault.both_ways else (1.0,)
@@ -655,8 +659,8 @@ def _draw_sizes_of_fault(fault: Fault, fit: Estimate, found: Sequence[tuple[str,
               for left, right in [sorted(_place_size(fault, x, way) for x in (low, high))]]
     limits = sorted(_place_size(fault, x, way) for x in (zones[0][0], end) for way in ways)
     return [*shades, call("errorbar", fit.value, 0, xerr=interval, color=INK, capsize=3, marker="o", ms=6),
-            *(dot(size, row, INK, marker="D", ms=4) for row, (_, size) in enumerate(found, 1)),
-            *name_rows(["refined", *(label for label, _ in found)]),
+            *(dot(size, row, INK, marker="D", ms=4) for row, (_, size) in enumerate(other_sizes, 1)),
+            *name_rows(["refined", *(label for label, _ in other_sizes)]),
             axes(xlim=(limits[0], limits[-1]), xlabel=fault.symbol + fault.bracketed_unit)]
 
 

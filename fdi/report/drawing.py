@@ -262,10 +262,10 @@ def thin_line(t: Floats, values: Floats) -> tuple[Floats, Floats]:
     rows = np.minimum(np.arange(width * LINE_COLUMNS), len(t) - 1).reshape(-1, width)
     missing = np.isnan(values)[rows]
     # of each piece the first row that has its extreme, and the first that is missing
-    picked = (np.where(missing, np.inf, values[rows]).argmin(1), np.where(missing, -np.inf, values[rows]).argmax(1),
-              missing.argmax(1))
-    chosen = np.unique(np.concatenate([rows[np.arange(len(rows)), at] for at in picked]))
-    return t[chosen], values[chosen]
+    positions = (np.where(missing, np.inf, values[rows]).argmin(1), np.where(missing, -np.inf, values[rows]).argmax(1),
+                 missing.argmax(1))
+    thinned_rows = np.unique(np.concatenate([rows[np.arange(len(rows)), at] for at in positions]))
+    return t[thinned_rows], values[thinned_rows]
 
 
 def to_svg(figure: Figure, salt: str) -> Drawing:
@@ -277,14 +277,14 @@ def to_svg(figure: Figure, salt: str) -> Drawing:
     from matplotlib import rc_context
 
     _name_artists(figure, salt)
-    lines = [(drawn, drawn.get_data(orig=False)) for ax in figure.axes for drawn in ax.lines]
-    for drawn, whole in lines:
-        drawn.set_data(*thin_line(*map(np.asarray, whole)))
+    lines = [(artist, artist.get_data(orig=False)) for ax in figure.axes for artist in ax.lines]
+    for artist, points in lines:
+        artist.set_data(*thin_line(*map(np.asarray, points)))
     out = io.StringIO()
     with rc_context(STYLE | {"svg.hashsalt": salt}):
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    for drawn, whole in lines:
-        drawn.set_data(*whole)
+    for artist, points in lines:
+        artist.set_data(*points)
     text = shorten_svg(out.getvalue(), 2)
     notes = html.escape(json.dumps([*_describe_axes(figure, salt)], separators=(",", ":")))
     drawing = Drawing(f'<svg data-axes="{notes}"{text[text.index("<svg") + 4:]}')
@@ -327,11 +327,11 @@ def _describe_axes(figure: Figure, salt: str) -> Iterator[dict[str, Any]]:
         if not ax.axison:
             continue
         place = ax.get_position()
-        joined = ax.get_shared_x_axes().joined
-        shared = min(j for j, other in enumerate(figure.axes) if other is ax or joined(ax, other))
+        is_joined = ax.get_shared_x_axes().joined
+        group = min(j for j, other in enumerate(figure.axes) if other is ax or is_joined(ax, other))
         limits = [_find_limits(ax.xaxis, ax.get_xlim()), _find_limits(ax.yaxis, ax.get_ylim())]
         yield {
-            "id": f"{salt}-{i}", "group": shared, "xlabel": ax.get_xlabel(), "ylabel": ax.get_ylabel(),
+            "id": f"{salt}-{i}", "group": group, "xlabel": ax.get_xlabel(), "ylabel": ax.get_ylabel(),
             "box": [round(float(x), 3) for x in (place.x0 * width, (1 - place.y1) * height, place.x1 * width,
                                                  (1 - place.y0) * height)],
             "x": limits[0][1], "y": limits[1][1], "kinds": [kind for kind, _ in limits],
@@ -378,11 +378,11 @@ def convert_figure(figure: Figure) -> Any:
         raise InputError("plotly", "", "the library plotly: pip install 'eha-rig[plots]'") from None
     figure.draw_without_rendering()  # places the axes
     out = PlotlyFigure()
-    shown = [ax for ax in figure.axes if ax.axison]
-    ends = ["", *map(str, range(2, len(shown) + 1))]  # of the names that plotly gives axes
-    for number, (end, ax) in enumerate(zip(ends, shown, strict=False)):
-        place, joined = ax.get_position(), ax.get_shared_x_axes().joined
-        first = next(k for k, other in enumerate(shown) if other is ax or joined(ax, other))
+    panels = [ax for ax in figure.axes if ax.axison]
+    ends = ["", *map(str, range(2, len(panels) + 1))]  # of the names that plotly gives axes
+    for number, (end, ax) in enumerate(zip(ends, panels, strict=False)):
+        place, is_joined = ax.get_position(), ax.get_shared_x_axes().joined
+        first = next(k for k, other in enumerate(panels) if other is ax or is_joined(ax, other))
         matches = {"matches": f"x{ends[first]}"} if first < number else {}
         out.layout[f"xaxis{end}"] = _describe_axis(ax.xaxis, place.intervalx, f"y{end}") | matches
         out.layout[f"yaxis{end}"] = _describe_axis(ax.yaxis, place.intervaly, f"x{end}")
@@ -451,8 +451,8 @@ def _find_points(ax: Axes, artist: Any, paths: Sequence[Any]) -> Floats:
     """The corners of paths, (n, 2), with a gap after each but the last; spans end at the limits of the panel."""
     gap = [[np.nan, np.nan]]
     points = np.vstack([rows for path in paths for rows in (path.vertices, gap)][:-1])
-    found: Floats = (artist.get_transform() - ax.transData).transform(points)
-    return found
+    corners: Floats = (artist.get_transform() - ax.transData).transform(points)
+    return corners
 
 
 def _make_line(points: Floats, colour: Any, width: float, dash: str = "solid") -> dict[str, Any]:

@@ -143,8 +143,8 @@ def find_signals(a: Answer) -> Signals:
 
 def describe_verdict(a: Answer) -> str:
     """The verdict in a sentence or two: the effect, its size, and the error before and after beside the noise floor."""
-    named = _named_candidates(a)
-    words, verb = join_words(c.effect for c in named), "explain" if len(named) > 1 else "explains"
+    candidates = _named_candidates(a)
+    words, verb = join_words(c.effect for c in candidates), "explain" if len(candidates) > 1 else "explains"
     error, floor, signals = a.baseline["error"], a.baseline["floor"], find_signals(a)
     floors = "; ".join(f"{signals.find(s).symbol} error {_format(error, s, signals)}, noise floor "
                        f"{_format(floor, s, signals)}" for s in error)
@@ -156,22 +156,22 @@ def describe_verdict(a: Answer) -> str:
                     f"{len(a.explanation.search.effects)} effects would change nothing in it that the tolerances do "
                     "not.")
         case "NOT_RESOLVABLE":
-            one = join_words((c.effect for c in named), "or")
-            return (f"The error is at the noise floor ({floors}). {one} may be present ({_describe_sizes(named)}), but "
-                    "it is too small in this test to be certain.")
+            one = join_words((c.effect for c in candidates), "or")
+            return (f"The error is at the noise floor ({floors}). {one} may be present ({_describe_sizes(candidates)}),"
+                    " but it is too small in this test to be certain.")
         case "AMBIGUOUS":
-            shared = list_shared_effects(a.explanation)
-            others = [name for name in a.explanation.effects if name not in shared]
-            one = join_words(others, "or")
-            said = f"{join_words(shared)} together with {one}" if shared else one
-            last = next((c for c in named if c.effect in others), a.candidates[0])
-            return (f"{said}: each explains the residual, and these data cannot discriminate between them; "
+            shared_effects = list_shared_effects(a.explanation)
+            alternatives = [name for name in a.explanation.effects if name not in shared_effects]
+            one = join_words(alternatives, "or")
+            subject = f"{join_words(shared_effects)} together with {one}" if shared_effects else one
+            last = next((c for c in candidates if c.effect in alternatives), a.candidates[0])
+            return (f"{subject}: each explains the residual, and these data cannot discriminate between them; "
                     f"{_describe_change(a, last)}.")
-        case word if word == "UNEXPLAINED" or not named:
+        case word if word == "UNEXPLAINED" or not candidates:
             return _describe_unexplained(a)
-    rest = f"{_describe_sizes(named)}; {_describe_change(a, named[-1])}."
+    rest = f"{_describe_sizes(candidates)}; {_describe_change(a, candidates[-1])}."
     if a.verdict == "EXPLAINED":
-        return f"{words} {'together ' if len(named) > 1 else ''}{verb} the residual: {rest}"
+        return f"{words} {'together ' if len(candidates) > 1 else ''}{verb} the residual: {rest}"
     if a.best.is_at_floor and a.best.is_far:
         return f"{words} {verb} the residual {FAR_OFF}: {rest} Something else may be missing instead."
     return f"{words} {verb} part of the residual: {rest} Something else is missing too."
@@ -198,9 +198,11 @@ def _named_candidates(a: Answer) -> list[Candidate]:
     return [c for c in a.candidates if c.effect in a.explanation.effects]
 
 
-def _describe_sizes(named: Sequence[Candidate], most: int = 2) -> str:
-    sizes = [", ".join(describe_parameter(name, v) for name, v in list(c.parameters.items())[:most]) for c in named]
-    return sizes[0] if len(named) == 1 else "; ".join(f"{c.effect}: {x}" for c, x in zip(named, sizes, strict=True))
+def _describe_sizes(candidates: Sequence[Candidate], most: int = 2) -> str:
+    sizes = [", ".join(describe_parameter(name, v) for name, v in list(c.parameters.items())[:most])
+             for c in candidates]
+    return sizes[0] if len(sizes) == 1 else "; ".join(
+        f"{c.effect}: {x}" for c, x in zip(candidates, sizes, strict=True))
 
 
 def describe_parameter(name: str, v: Value) -> str:
@@ -243,9 +245,9 @@ def describe_findings(a: Answer) -> list[Line]:
     elif a.verdict == "AMBIGUOUS":
         separation = "no sensor and no command that was tried discriminates between them"
     is_another = a.verdict in ("PARTLY", "UNEXPLAINED") and a.best.is_far
-    left = max(a.best.ratio.values())
-    doubt = (f"The best leaves {format_ratio(left)} noise floors: is this recording from this plant, in its units? "
-             if left > RESIDUAL_FOREIGN else "")
+    worst_ratio = max(a.best.ratio.values())
+    doubt = (f"The best leaves {format_ratio(worst_ratio)} noise floors: is this recording from this plant, in its "
+             "units? " if worst_ratio > RESIDUAL_FOREIGN else "")
     return [Line("to discriminate", separation), Line("residual", a.pattern),
             *([] if a.law is None else [Line("law", _describe_law(a.law)), *(
                 Line("not observable", f"{PLACES[place]}: {why}") for place, why in a.law.hidden.items())]),
@@ -256,27 +258,27 @@ def describe_findings(a: Answer) -> list[Line]:
 
 def _describe_undecided(a: Answer) -> str:
     """Why a held-out run was not judged as a whole, if so."""
-    held = a.explanation.unseen.get(a.best.effects)
-    if held is None or not held.decided:
+    held_out_run = a.explanation.unseen.get(a.best.effects)
+    if held_out_run is None or not held_out_run.decided:
         return ""
-    worst = max(held.decided[s] / a.explanation.floor[s] for s in held.decided)
-    return (f"{format_percent(held.undecided)} of it is not judged, because stops there depend on a "
+    worst = max(held_out_run.decided[s] / a.explanation.floor[s] for s in held_out_run.decided)
+    return (f"{format_percent(held_out_run.undecided)} of it is not judged, because stops there depend on a "
             f"thousandth of a friction level; the rest is at {format_ratio(worst)} times the noise floor")
 
 
-def describe_suspicious(found: Sequence[Suspicious], most: int = 4) -> str:
+def describe_suspicious(parameters: Sequence[Suspicious], most: int = 4) -> str:
     """Parameters further from their nominal values than in any healthy unit; "" for none."""
-    worst = sorted(found, key=lambda s: -abs(s.tolerances))
+    worst = sorted(parameters, key=lambda s: -abs(s.tolerances))
     words = [f"{s.parameter} {format_amount(s.value, s.unit)} ({s.tolerances:+.1f} tolerances)" for s in worst]
     return f"{list_first(words, most)}: outside the range of a healthy unit" if words else ""
 
 
 def describe_blind(a: Answer) -> str:
     """The effects that the tolerances make up for up to their usual size, and what would reveal each of them."""
-    named = join_words(f"{b.effect} (up to {format_amount(b.usual, b.unit)})" for b in a.blind)
+    effects = join_words(f"{b.effect} (up to {format_amount(b.usual, b.unit)})" for b in a.blind)
     aids = dict.fromkeys(b.revealed_by for b in a.blind)
-    revealed = [f"{aid} would reveal {join_words(b.effect for b in a.blind if b.revealed_by == aid)}" for aid in aids]
-    return "; ".join([named, *revealed])
+    hints = [f"{aid} would reveal {join_words(b.effect for b in a.blind if b.revealed_by == aid)}" for aid in aids]
+    return "; ".join([effects, *hints])
 
 
 def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
@@ -291,8 +293,9 @@ def _tabulate_candidates(a: Answer, most: int = 8) -> Table:
 
     def show_ratios(ratios: BySignal, holdout: BySignal) -> list[str]:
         """Errors over noise floors: of each signal; on the held-out run of the worst signal, then of each."""
-        held = {s: x / floor[s] for s, x in holdout.items() if s in floor}
-        also = [max(held.values(), default=math.nan), *(held.get(s, math.nan) for s in floor)] if has_holdout else []
+        holdout_ratios = {s: x / floor[s] for s, x in holdout.items() if s in floor}
+        also = [max(holdout_ratios.values(), default=math.nan),
+                *(holdout_ratios.get(s, math.nan) for s in floor)] if has_holdout else []
         return list(map(format_ratio, [*(ratios.get(s, math.nan) for s in floor), *also]))
 
     rows: list[list[Cell | str]] = [[Cell(text, "muted") for text in (
@@ -315,9 +318,9 @@ def _list_parameters(parameters: Mapping[str, Value]) -> Table:
         Column("value and 95 % interval"), lambda name: format_interval(*parameters[name])), is_list=True)
 
 
-def _list_suspicious(found: Sequence[Suspicious]) -> Section:
+def _list_suspicious(parameters: Sequence[Suspicious]) -> Section:
     return Section("Suspicious parameters", [tabulate(
-        found, (Column("parameter"), lambda s: s.parameter),
+        parameters, (Column("parameter"), lambda s: s.parameter),
         (Column("fitted value", align="right"), lambda s: format_amount(s.value, s.unit)),
         (Column("tolerances", align="right"), lambda s: Cell(f"{s.tolerances:+.1f}", "bad")),
         caption="To explain the data, the fit had to move these parameters further than they differ between healthy "
@@ -356,10 +359,10 @@ def draw_claims(claims: Sequence[Claim]) -> str:
     """How often each effect was named, by its size over the largest usual one."""
     marks: list[Mark] = [*name_rows([c.effect for c in claims])]
     for y, c in enumerate(claims):
-        for size, named, of in c.counts:
-            x, colour = size / c.largest, choose_colour_of_share(named / of)
+        for size, count, of in c.counts:
+            x, colour = size / c.largest, choose_colour_of_share(count / of)
             marks += [dot(x, y, colour, marker="s", ms=15, alpha=0.3),
-                      call("text", x, y, f"{named}/{of}", ha="center", va="center", fontsize=7)]
+                      call("text", x, y, f"{count}/{of}", ha="center", va="center", fontsize=7)]
     marks.append(axes(xscale="log", xlim=(0.5**RUNGS, 1.5), xlabel="size over the largest usual size"))
     return draw_panels("claims", [[marks]], 0.8 + 0.27 * len(claims))
 
@@ -374,21 +377,22 @@ def choose_colour_of_share(share: float) -> str:
 def collect_data(a: Answer, notes: Sequence[str] = (), claims: Sequence[Claim] = ()) -> dict[str, Any]:
     """The answer of `rig explain --json`, with notes on the runs and claims of sizes; SI units."""
     e = a.explanation
-    held = e.unseen.get(a.best.effects)
+    held_out_run = e.unseen.get(a.best.effects)
     has_ledger = len(e.effects) > 1 and e.verdict != "AMBIGUOUS"
     candidates = []
     for c in a.candidates:
         row = c._asdict() | {"parameters": {name: v._asdict() for name, v in c.parameters.items()}, "ratio": c.ratio}
         candidates.append(row | {"with": row.pop("beside")})
     sometimes = {
-        "undecided": {"share": held.undecided, "holdout": held.decided} if held is not None and held.decided else None,
+        "undecided": {"share": held_out_run.undecided, "holdout": held_out_run.decided}
+        if held_out_run is not None and held_out_run.decided else None,
         "law_search": None if a.law is None else _collect_law_data(a.law, a.law_effects),
         "excerpt": e.excerpt or None,
         "ledger": [{"effect": effect, "error": error, "holdout": holdout} for effect, error, holdout in a.ledger]
         if has_ledger else None,
         "sensitivity": [{"effect": c.effect, "parameter": c.parameter, "unit": c.unit, "smallest_named": c.smallest,
                          "named": c.named._asdict() if c.named else None,
-                         "counts": [{"size": size, "named": named, "of": of} for size, named, of in c.counts],
+                         "counts": [{"size": size, "named": count, "of": of} for size, count, of in c.counts],
                          "taken_for": c.taken_for} for c in claims] or None}
     return {
         "verdict": e.verdict, "effects": e.effects, "candidates": candidates,
@@ -414,11 +418,11 @@ def draw_change(trace: Trace, before: Hypothesis, after: Hypothesis | None, floo
         *([] if after is None else [(name_of_after, AFTER, after.fit.residuals[:, :len(trace)])])], floor)
 
 
-def draw_ledger(rows: Sequence[Row], floor: BySignal, declared: Signals) -> str:
+def draw_ledger(rows: Sequence[Row], floor: BySignal, signals: Signals) -> str:
     """Error over noise floor of each signal after each effect, on the fitted run and the held-out one, if there is one.
     """
-    x, signals = np.arange(len(rows)), [s for s in floor if s in rows[0].error]
-    names = [name_step(row) for row in rows]
+    x, signal_names = np.arange(len(rows)), [s for s in floor if s in rows[0].error]
+    step_names = [name_step(row) for row in rows]
     runs = [("fitted run", AFTER, [row.error for row in rows])]
     if any(row.holdout for row in rows):
         runs += [("held-out run", ORANGE, [row.holdout for row in rows])]
@@ -428,11 +432,11 @@ def draw_ledger(rows: Sequence[Row], floor: BySignal, declared: Signals) -> str:
                      color=color, label=label) for place, (label, color, errors) in enumerate(runs)]
         return [*bars,
                 level(1.0, GREEN, width=1.2),
-                call("set_xticks", x + 0.19 * (len(runs) - 1), names, rotation=20, ha="right"),
-                axes(yscale="log", title=declared.find(s).symbol,
-                     ylabel="error over noise floor" if s == signals[0] else "")]
+                call("set_xticks", x + 0.19 * (len(runs) - 1), step_names, rotation=20, ha="right"),
+                axes(yscale="log", title=signals.find(s).symbol,
+                     ylabel="error over noise floor" if s == signal_names[0] else "")]
 
-    return draw_panels("ledger", [list(map(draw_signal, signals))], 2.9, common_legend=True, sharey=True)
+    return draw_panels("ledger", [list(map(draw_signal, signal_names))], 2.9, common_legend=True, sharey=True)
 
 
 def name_step(row: Row) -> str:
@@ -482,27 +486,27 @@ def draw_law(c: LawCurve) -> str:
 PLACES = {"force": "force on the ram", "flow": "flow to the jack", "current": "current in the torque motor"}
 
 
-def _list_law_sections(found: LawSearch) -> list[Section]:
+def _list_law_sections(search: LawSearch) -> list[Section]:
     """The law with its terms, what error it leaves, what the residual follows, and the picture of both."""
-    law = found.law if found.law is not None and found.law.holds else None
+    law = search.law if search.law is not None and search.law.holds else None
     return [
         Section("Law", [] if law is None else [_tabulate_terms(law)]),
-        Section("Error with the law", [] if law is None else [_tabulate_law_errors(found, law)]),
-        Section("What the residual follows", [_tabulate_dependences(found.missing)], medium=Medium.PAGE),
-        Section("Law and measurement", [] if law is None or found.curve is None else [Figure(
-            f"Points: the missing {found.curve.place} in bins; shaded: two standard errors. Line: the law in the same "
-            "bins. The law holds where the line is within the shaded band.", partial(draw_law, found.curve))])]
+        Section("Error with the law", [] if law is None else [_tabulate_law_errors(search, law)]),
+        Section("What the residual follows", [_tabulate_dependences(search.missing)], medium=Medium.PAGE),
+        Section("Law and measurement", [] if law is None or search.curve is None else [Figure(
+            f"Points: the missing {search.curve.place} in bins; shaded: two standard errors. Line: the law in the same "
+            "bins. The law holds where the line is within the shaded band.", partial(draw_law, search.curve))])]
 
 
-def _describe_law(found: LawSearch) -> str:
+def _describe_law(search: LawSearch) -> str:
     """The law, or why there is none."""
-    law = found.law
+    law = search.law
     if law is None:
         return "no term lowers the error of pieces of the run that its fit did not see; none is written"
     names = " + ".join(term.words for term in law.terms)
     if not law.holds:
         return f"none holds: the best one tried was {names}, but {law.reason}; none is written"
-    beside = f", beside {' and '.join(found.base.effects)}" if found.base.effects else ""
+    beside = f", beside {' and '.join(search.base.effects)}" if search.base.effects else ""
     equal = f"; {' or '.join(law.equals)} would fit as well" if law.equals else ""
     return f"{names}{beside}: {law.reason}{equal}"
 
@@ -516,26 +520,26 @@ def _tabulate_terms(law: Law) -> Table:
         f"The law: {describe_formula(law.terms)}.", is_list=True)
 
 
-def _tabulate_law_errors(found: LawSearch, law: Law) -> Table:
-    signals = found.signals
+def _tabulate_law_errors(search: LawSearch, law: Law) -> Table:
+    signals = search.signals
     columns = [Column(f"{signals.find(s).symbol}{words}", align="right")
-               for words in ("", ", held-out")[:2 if law.holdout else 1] for s in found.floor]
+               for words in ("", ", held-out")[:2 if law.holdout else 1] for s in search.floor]
     rows: list[list[Cell | str]] = [
         [Cell(name, "good", True) if name == "with the law" else name,
-         *[_format(errors, s, signals) for errors in sides for s in found.floor][:len(columns)]]
-        for name, *sides in _list_errors(found, law)]
+         *[_format(errors, s, signals) for errors in sides for s in search.floor][:len(columns)]]
+        for name, *sides in _list_errors(search, law)]
     return Table([Column("model"), *columns], rows, (
         "Errors, RMS; of the held-out run those of the typical block (the worst 15 % are left out). The law explains "
         "what is missing where its error reaches the noise floor on both runs."))
 
 
-def _list_errors(found: LawSearch, law: Law) -> list[tuple[str, BySignal, BySignal]]:
+def _list_errors(search: LawSearch, law: Law) -> list[tuple[str, BySignal, BySignal]]:
     """(model, RMS errors on the fitted run, on the held-out run) without, with the catalogue's best, with the law."""
-    best = found.catalogue
-    return [("as it was", found.base.errors, found.holdout.get("base", {})),
+    best = search.catalogue
+    return [("as it was", search.base.errors, search.holdout.get("base", {})),
             *([] if best is None else [(f"with {' + '.join(best.effects)}", best.errors,
-                                        found.holdout.get("catalogue", {}))]),
-            ("with the law", law.hypothesis.errors, law.holdout), ("noise floor", found.floor, found.floor)]
+                                        search.holdout.get("catalogue", {}))]),
+            ("with the law", law.hypothesis.errors, law.holdout), ("noise floor", search.floor, search.floor)]
 
 
 def _tabulate_dependences(missing: Sequence[Missing]) -> Table:
@@ -551,22 +555,22 @@ def _tabulate_dependences(missing: Sequence[Missing]) -> Table:
         "it whatever its cause.")
 
 
-def _collect_law_data(found: LawSearch, effects: Sequence[str]) -> dict[str, Any]:
+def _collect_law_data(search: LawSearch, effects: Sequence[str]) -> dict[str, Any]:
     """The keys of `rig explain --json` about the law; SI units."""
-    law = found.law
+    law = search.law
     return {
         "missing": [{"place": m.balance.place, "size": m.balance.size, "unit": m.balance.unit,
                      "over_noise": m.balance.ratio,
                      "follows": [{"states": d.states, "share": d.share, "holdout": d.holdout,
-                                  "p_value": d.p_value} for d in m.dependences]} for m in found.missing],
-        "not_observable": found.hidden,
+                                  "p_value": d.p_value} for d in m.dependences]} for m in search.missing],
+        "not_observable": search.hidden,
         "law": None if law is None else {
             "holds": law.holds, "reason": law.reason, "formula": describe_formula(law.terms),
             "terms": [{"term": t.name, "place": t.place, "meaning": t.words,
                        "parameters": {f: law.values[f]._asdict() for f in t.fields}} for t in law.terms],
-            "beside": found.base.effects, "equal_terms": law.equals, "effects": effects,
-            "errors": [{"model": name, "error": error, "holdout": held}
-                       for name, error, held in _list_errors(found, law)]}}
+            "beside": search.base.effects, "equal_terms": law.equals, "effects": effects,
+            "errors": [{"model": name, "error": error, "holdout": holdout}
+                       for name, error, holdout in _list_errors(search, law)]}}
 
 
 GOOD_RATIO = 1.15  # error over noise floor up to which a cell is green

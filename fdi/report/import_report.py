@@ -38,16 +38,16 @@ def build_import_report(imported: Imported, measurement: Measurement, out: Path)
 def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path, model: str | None = None) -> Report:
     """Which column is taken for which signal; `model`: of the plant, as the next command names it."""
     moods: dict[str, Mood] = {"sure": "good", "likely": "doubtful", "unsure": "bad"}
-    chosen = guessed.chosen
+    columns = guessed.chosen
     signals = guessed.signals
-    missing = [s.symbol for s in list_recorded(signals) if s.name in signals.required and s.name not in chosen]
-    left = [f"{name} ({why})" for name, why in guessed.left.items()]
+    missing = [s.symbol for s in list_recorded(signals) if s.name in signals.required and s.name not in columns]
+    unused_columns = [f"{name} ({why})" for name, why in guessed.left.items()]
     notes = [*([f"no column was found for {', '.join(missing)}: complete the map by hand"] if missing else []),
-             *([f"columns left out: {list_first(left, MOST)}"] if left else [])]
+             *([f"columns left out: {list_first(unused_columns, MOST)}"] if unused_columns else [])]
     table = tabulate(
-        chosen, (Column("signal"), lambda name: name if name == "time" else signals.find(name).symbol),
-        (Column("source"), lambda name: chosen[name][0]),
-        (Column("confidence"), lambda name: Cell(chosen[name][1], moods[chosen[name][1]])),
+        columns, (Column("signal"), lambda name: name if name == "time" else signals.find(name).symbol),
+        (Column("source"), lambda name: columns[name][0]),
+        (Column("confidence"), lambda name: Cell(columns[name][1], moods[columns[name][1]])),
         caption="The map says why in comments. Check what is not sure.")
     return Report("import", str(measurement.path), notes=notes, sections=[Section("Guess", [table])],
                   sentence=f"{out}: first map of {measurement.path.name} ({measurement.format}); check it",
@@ -58,12 +58,12 @@ def build_guess_report(guessed: GuessedMap, measurement: Measurement, out: Path,
 
 def _list_notes(imported: Imported, measurement: Measurement) -> list[str]:
     """Signals that the trace does not have, and columns of the recording that no signal uses."""
-    signals, known = imported.trace.declared, {s.name for s in imported.signals}
-    unused = [name for name in measurement.units if name not in imported.used]
-    return [*(f"no {s.symbol}: {s.quantity} is not judged by itself" for s in signals.outputs if s.name not in known),
+    signals, names = imported.trace.declared, {s.name for s in imported.signals}
+    unused_columns = [name for name in measurement.units if name not in imported.used]
+    return [*(f"no {s.symbol}: {s.quantity} is not judged by itself" for s in signals.outputs if s.name not in names),
             *([f"no {signals.load.symbol}: it is taken as 0; a load that did act is then a force that the model lacks"]
-              if signals.load and signals.load.name not in known else []),
-            *([f"not in the map, not imported: {list_first(unused, MOST)}"] if unused else [])]
+              if signals.load and signals.load.name not in names else []),
+            *([f"not in the map, not imported: {list_first(unused_columns, MOST)}"] if unused_columns else [])]
 
 
 def _format_range(s: ImportedSignal, si: str) -> str:

@@ -37,8 +37,8 @@ def format_interval(value: float, low: float, high: float, unit: str, most_digit
     largest = max((abs(x) for x in (value, low, high) if math.isfinite(x)), default=0.0)
     scale, name = choose_unit(unit, largest)
     digits = _digits_of_interval(0.5 * abs(high - low), largest, most_digits)
-    shown = [format_digits(x / scale, digits, largest / scale) for x in (value, low, high)]
-    return f"{shown[0]} {name}".rstrip() + f" ({shown[1]} .. {shown[2]})"
+    texts = [format_digits(x / scale, digits, largest / scale) for x in (value, low, high)]
+    return f"{texts[0]} {name}".rstrip() + f" ({texts[1]} .. {texts[2]})"
 
 
 def _digits_of_interval(half: float, largest: float, most: int) -> int:
@@ -97,8 +97,8 @@ def format_digits(x: float, digits: int = 3, size: float | None = None) -> str:
     if x == 0.0 or reference == 0.0:
         return "0"
     place = math.floor(math.log10(reference))
-    shown = f"{x:.{max(0, digits - 1 - place)}f}" if -4 <= place <= 6 else f"{x:.{digits - 1}e}"
-    return shown if float(shown) else shown.lstrip("-")  # not "-0.0"
+    text = f"{x:.{max(0, digits - 1 - place)}f}" if -4 <= place <= 6 else f"{x:.{digits - 1}e}"
+    return text if float(text) else text.lstrip("-")  # not "-0.0"
 
 
 def choose_unit(unit: str, size: float) -> tuple[float, str]:
@@ -107,8 +107,8 @@ def choose_unit(unit: str, size: float) -> tuple[float, str]:
     >>> choose_unit("m", 2e-3), choose_unit("kg", 5.0), choose_unit("1", 0.2)
     ((0.001, 'mm'), (1.0, 'kg'), (1.0, ''))
     """
-    known = READABLE_UNITS.get(unit, ((1.0, "" if unit == "1" else unit),))
-    return next((found for found in reversed(known) if size >= found[0]), known[0])
+    units = READABLE_UNITS.get(unit, ((1.0, "" if unit == "1" else unit),))
+    return next((pair for pair in reversed(units) if size >= pair[0]), units[0])
 
 
 def format_limit(value: float, unit: str, size: float | None = None) -> str:
@@ -140,10 +140,10 @@ def join_words(words: Iterable[str], conjunction: str = "and") -> str:
     >>> join_words(["a", "b", "c"]), join_words(["a", "b"], "or")
     ('a, b and c', 'a or b')
     """
-    every = list(words)
-    if len(every) < 2:
-        return "".join(every)
-    return f"{', '.join(every[:-1])} {conjunction} {every[-1]}"
+    texts = list(words)
+    if len(texts) < 2:
+        return "".join(texts)
+    return f"{', '.join(texts[:-1])} {conjunction} {texts[-1]}"
 
 
 def list_first(words: Sequence[str], most: int) -> str:

@@ -180,8 +180,8 @@ class Section:
 
     def select_items(self, medium: Medium) -> list[Item]:
         """The items that one medium shows; none if it does not show the section."""
-        shown = (item for item in self.items if self.medium.includes(medium) and item.medium.includes(medium))
-        return [item for item in shown if not ((isinstance(item, Table) and not item.rows)
+        items = (item for item in self.items if self.medium.includes(medium) and item.medium.includes(medium))
+        return [item for item in items if not ((isinstance(item, Table) and not item.rows)
                                                or (isinstance(item, Line) and not item.text))]
 
 
@@ -219,8 +219,8 @@ class Report:
 
     def select_sections(self, medium: Medium) -> list[tuple[Section, list[Item]]]:
         """The sections that one medium shows, each with its items there."""
-        chosen = ((section, section.select_items(medium)) for section in self.sections)
-        return [(section, items) for section, items in chosen if items]
+        pairs = ((section, section.select_items(medium)) for section in self.sections)
+        return [(section, items) for section, items in pairs if items]
 
 
 def to_json(data: Mapping[str, Any]) -> str:

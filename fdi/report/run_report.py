@@ -116,11 +116,11 @@ def build_run_report(trace: Trace) -> Report:
 
 def _list_facts(trace: Trace) -> list[tuple[str, str]]:
     main, notes = int((trace.phase == 1).sum()), trace.provenance
-    judged = (("checks passed", trace.sequence_checks), ("protocol checks passed", trace.protocol_checks))
-    passed = [(name, f"{sum(check.passed for check in checks)} of {len(checks)}") for name, checks in judged if checks]
+    groups = (("checks passed", trace.sequence_checks), ("protocol checks passed", trace.protocol_checks))
+    counts = [(name, f"{sum(check.passed for check in checks)} of {len(checks)}") for name, checks in groups if checks]
     kind = notes.get("timing.kind", "")
     why = notes.get("timing.reason") or KINDS_OF_TIMING.get(kind)
-    facts = [("main phase", f"{main * trace.period:.3f} s, {main} cycles"), *passed,
+    facts = [("main phase", f"{main * trace.period:.3f} s, {main} cycles"), *counts,
              *((name, notes.get(name, "")) for name in ("model", "seed", "bus", "pace", "started", "host")),
              ("differs from nominal", notes.get("differences.text", "")),
              ("decision rule", DECISIONS.get(notes.get("metrology.decision", ""), "")),
@@ -147,10 +147,10 @@ def _show_cause(trace: Trace) -> list[Item]:
 def _read_list(text: str) -> list[Any]:
     """A list in JSON; empty for another text, for a log may come from another program."""
     try:
-        found = json.loads(text)
+        entries = json.loads(text)
     except (ValueError, RecursionError):
         return []
-    return found if isinstance(found, list) else []
+    return entries if isinstance(entries, list) else []
 
 
 def _show_diagnosis(trace: Trace) -> list[Item]:
@@ -209,12 +209,12 @@ def _tabulate_skipped(trace: Trace) -> Table:
 
 def _show_failed_checks(trace: Trace, most: int = 12) -> list[Item]:
     """A close-up of each of the first `most` failed checks that have a window and a signal."""
-    failed = [check for check in trace.sequence_checks if check.verdict == "FAIL" and not math.isnan(check.t0)]
+    checks = [check for check in trace.sequence_checks if check.verdict == "FAIL" and not math.isnan(check.t0)]
     return [Figure(f"{check.name}: {_name_measure(check)}, "
                    f"{check.detail if math.isnan(check.value) else f'{check.measured} measured'}, limit "
                    f"{check.shown_limits}{check.unit_behind}. Dashed: limits; red: what was measured.",
                    partial(draw_failed_check, trace, check, f"check{number}"))
-            for number, check in enumerate(failed[:most])]
+            for number, check in enumerate(checks[:most])]
 
 
 def _name_measure(check: CheckResult) -> str:
@@ -232,15 +232,15 @@ def _format_window(check: CheckResult) -> str:
 
 
 def _show_timing(trace: Trace) -> list[Item]:
-    timed = ((name, getattr(trace.timing, field)) for name, field in TIMES.items())
-    known = [(name, values[~np.isnan(values)] * 1e6) for name, values in timed if not np.isnan(values).all()]
-    if not known:
+    series = ((name, getattr(trace.timing, field)) for name, field in TIMES.items())
+    times = [(name, values[~np.isnan(values)] * 1e6) for name, values in series if not np.isnan(values).all()]
+    if not times:
         return []
     columns = [Column("wall clock"), *(Column(name, "us", "right") for name in ("p50", "p99", "p99.9", "max"))]
     return [Figure("Number of cycles by duration, both axes logarithmic; the dotted line is the 99th percentile.",
                    partial(draw_timing, trace)),
             Table(columns, [[name, *(f"{x:.0f}" for x in np.percentile(values, [50, 99, 99.9, 100]))]
-                            for name, values in known], "p99 is the time that 99 of 100 cycles stay below."),
+                            for name, values in times], "p99 is the time that 99 of 100 cycles stay below."),
             Line("overruns", f"{int(trace.timing.overrun.sum())} of {len(trace.timing.t)}")]
 
 
@@ -252,8 +252,8 @@ def _tabulate_events(events: Sequence[Event], most: int = 12, most_on_page: int 
     equal: dict[tuple[str, ...], list[Event]] = {}
     for event in events:
         equal.setdefault(event[1:], []).append(event)
-    events = [each[0] if len(each) == 1 else each[0]._replace(
-        text=f"{each[0].text} ({len(each)} times, the last at {each[-1].t:.3f} s)") for each in equal.values()]
+    events = [group[0] if len(group) == 1 else group[0]._replace(
+        text=f"{group[0].text} ({len(group)} times, the last at {group[-1].t:.3f} s)") for group in equal.values()]
     columns = ((Column("t", "s", "right"), lambda event: f"{event.t:.3f}"),
                (Column("level", medium=Medium.PAGE), lambda event: Cell(event.level, EVENT_MOODS.get(event.level, ""))),
                (Column("kind"), lambda event: event.kind), (Column("event"), lambda event: event.text))
@@ -277,15 +277,15 @@ class Verdict(NamedTuple):
 def read_verdict(trace: Trace) -> Verdict:
     """The verdict in the log of the run; of a trace without one (recovered, CSV) that of its checks."""
     notes = trace.provenance
-    failed = [check.name for check in trace.checks if check.verdict == "FAIL"]
+    failed_names = [check.name for check in trace.checks if check.verdict == "FAIL"]
     words = {check.verdict for check in trace.checks}
-    judged = next((word for word in ("FAIL", "CANNOT_TELL", "PASS") if word in words), "NOT_JUDGED")
-    word, why = notes.get("verdict.verdict") or judged, notes.get("verdict.why", "")
+    default_word = next((word for word in ("FAIL", "CANNOT_TELL", "PASS") if word in words), "NOT_JUDGED")
+    word, why = notes.get("verdict.verdict") or default_word, notes.get("verdict.why", "")
     match word:
         case "INVALID_TIMING":
             why = notes.get("verdict.timing", why)
-        case "FAIL" if failed and not why:
-            why = f"{len(failed)} of {len(trace.checks)} checks failed: {list_first(failed, 4)}"
+        case "FAIL" if failed_names and not why:
+            why = f"{len(failed_names)} of {len(trace.checks)} checks failed: {list_first(failed_names, 4)}"
         case "FAIL" if not why:
             why = "the checks passed, but the run did not end as the sequence says"
     return Verdict(word, why)
@@ -300,7 +300,7 @@ def draw_signals(trace: Trace) -> str:
     """
     d, t, error, half = trace.declared, trace.t, trace.command - trace.controlled, _choose_close_up(trace)
     size, fine = choose_unit(d.controlled.unit, 0.0)
-    shown = [(trace.controlled, f"{name_controlled(d)} [{d.controlled.shown_unit}]", d.controlled.shown_scale, BLUE),
+    plots = [(trace.controlled, f"{name_controlled(d)} [{d.controlled.shown_unit}]", d.controlled.shown_scale, BLUE),
              (error, f"error [{fine}]", 1.0 / size, ORANGE),
              (error if half else np.full_like(error, math.nan), f"error, close up [{fine}]", 1.0 / size, ORANGE),
              (trace.drive, f"{d.drive.phrase} [{d.drive.shown_unit}]", d.drive.shown_scale, VIOLET),
@@ -312,7 +312,7 @@ def draw_signals(trace: Trace) -> str:
     panels = [[line(t, _bridge_short_gaps(values) * scale, colour, None if number else legends[0]),
                _mark_missing(trace, values), *(shade(t0, t1, FAULT, 0.5) for _, t0, t1 in faults),
                axes(ylabel=label, **{"ylim": (-half * scale, half * scale)} if number == 2 else {})]
-              for number, (values, label, scale, colour) in enumerate(shown)
+              for number, (values, label, scale, colour) in enumerate(plots)
               if number == 0 or not np.isnan(values).all()]  # the first one has the command
     panels[0] = [line(t, trace.command * d.command.shown_scale, COMMAND, legends[1], 2.4), *panels[0], legend(2),
                  *(call("annotate", f" {fault}", (t0, 0.07), xycoords=("data", "axes fraction"), fontsize=7)
@@ -325,15 +325,15 @@ def draw_signals(trace: Trace) -> str:
 
 def list_faults(trace: Trace) -> list[tuple[str, float, float]]:
     """The faults that the run injected: name, begin and end in s; one that never ends lasts to the end of the trace."""
-    begun: dict[str, float] = {}
-    found = []
+    starts: dict[str, float] = {}
+    faults = []
     for event in trace.events:
         name, _, word = event.text.rpartition(" ")
         if event.kind == "fault" and word == "begins":
-            begun[name] = event.t
-        elif event.kind == "fault" and name in begun:
-            found.append((name, begun.pop(name), event.t))
-    return found + [(name, t0, float(trace.t[-1])) for name, t0 in begun.items()]
+            starts[name] = event.t
+        elif event.kind == "fault" and name in starts:
+            faults.append((name, starts.pop(name), event.t))
+    return faults + [(name, t0, float(trace.t[-1])) for name, t0 in starts.items()]
 
 
 def draw_timing(trace: Trace) -> str:
@@ -343,10 +343,10 @@ def draw_timing(trace: Trace) -> str:
     for (name, field), colour in zip(TIMES.items(), (BLUE, ORANGE, GREY), strict=True):
         values = getattr(trace.timing, field)
         if (values > 0).any():
-            known = np.maximum(values[~np.isnan(values)] * 1e6, shortest_time)
-            bins = np.logspace(math.log10(known.min()), math.log10(max(float(known.max()), 1.0)) + 0.02, 60)
-            panels.append([call("hist", known, bins=bins.tolist(), color=colour, log=True, histtype="stepfilled"),
-                           instant(float(np.percentile(known, 99)), INK, width=0.8, style=":"),
+            times = np.maximum(values[~np.isnan(values)] * 1e6, shortest_time)
+            bins = np.logspace(math.log10(times.min()), math.log10(max(float(times.max()), 1.0)) + 0.02, 60)
+            panels.append([call("hist", times, bins=bins.tolist(), color=colour, log=True, histtype="stepfilled"),
+                           instant(float(np.percentile(times, 99)), INK, width=0.8, style=":"),
                            axes(xscale="log", xlabel=f"{name} [us]",
                                 ylabel="" if panels else "cycles (dotted: p99)")])
     if not panels:
@@ -357,21 +357,21 @@ def draw_timing(trace: Trace) -> str:
 
 def _bridge_short_gaps(values: Floats) -> Floats:
     """Straight lines over up to BRIDGED missing samples: single samples between gaps would be invisible."""
-    known = np.flatnonzero(~np.isnan(values))
-    if not len(known):
+    sample_rows = np.flatnonzero(~np.isnan(values))
+    if not len(sample_rows):
         return values
     rows = np.arange(len(values))
-    after = known[np.minimum(np.searchsorted(known, rows), len(known) - 1)]
-    before = known[np.maximum(np.searchsorted(known, rows, side="right") - 1, 0)]
-    near = (after >= rows) & (before <= rows) & (after - before <= BRIDGED + 1)
-    return np.where(near, np.interp(rows, known, values[known]), values)
+    after = sample_rows[np.minimum(np.searchsorted(sample_rows, rows), len(sample_rows) - 1)]
+    before = sample_rows[np.maximum(np.searchsorted(sample_rows, rows, side="right") - 1, 0)]
+    is_near = (after >= rows) & (before <= rows) & (after - before <= BRIDGED + 1)
+    return np.where(is_near, np.interp(rows, sample_rows, values[sample_rows]), values)
 
 
 def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:
     """A red mark at the foot of the panel in each of so many columns in which samples are missing."""
     starts = np.linspace(0, len(values), min(columns, len(values)) + 1).astype(int)
-    lost = np.logical_or.reduceat(np.isnan(values), starts[:-1])
-    edges = np.flatnonzero(np.diff(lost, prepend=False, append=False)).reshape(-1, 2)
+    is_missing = np.logical_or.reduceat(np.isnan(values), starts[:-1])
+    edges = np.flatnonzero(np.diff(is_missing, prepend=False, append=False)).reshape(-1, 2)
     ends = [(float(trace.t[starts[a]]), float(trace.t[starts[b] - 1]) + trace.period) for a, b in edges]
     return spans(ends, RED, 0.04, lw=0.5, zorder=3)
 
@@ -456,8 +456,8 @@ class _View(NamedTuple):
     @property
     def longest(self) -> float:
         """The longest of the measured time and its limits, s; 0 without any."""
-        known = (x for x in (self.check.value, self.check.high, self.check.low) if not math.isnan(x))
-        return max((abs(self.to_seconds(x)) for x in known), default=0.0)
+        values = (x for x in (self.check.value, self.check.high, self.check.low) if not math.isnan(x))
+        return max((abs(self.to_seconds(x)) for x in values), default=0.0)
 
 
 def draw_failed_check(trace: Trace, check: CheckResult, salt: str = "check") -> str:
@@ -515,8 +515,8 @@ def _draw_size(view: _View) -> Panel:
 
 def _draw_response(view: _View) -> Panel:
     """Demand and position; for a gain also the amplitudes that the limits allow, and the measured one."""
-    d, shown = view.trace.declared, view.shown
-    scale, com = d.controlled.shown_scale, d.controlled.shown_scale * shown.command
+    d, window = view.trace.declared, view.shown
+    scale, com = d.controlled.shown_scale, d.controlled.shown_scale * window.command
     middle, amplitude = 0.5 * (np.nanmax(com) + np.nanmin(com)), 0.5 * (np.nanmax(com) - np.nanmin(com))
 
     def place(value: float, colour: str, label: str, width: float, style: str) -> list[Mark]:
@@ -524,8 +524,8 @@ def _draw_response(view: _View) -> Panel:
             return [line([], [], colour, label, ls=style)]
         return levels(value * amplitude, colour, label, width, style, middle)
 
-    return [line(shown.t, com, COMMAND, d.command.symbol, 1.6),
-            line(shown.t, scale * shown.controlled, BLUE, d.controlled.symbol), *_draw_lines(view.check, place),
+    return [line(window.t, com, COMMAND, d.command.symbol, 1.6),
+            line(window.t, scale * window.controlled, BLUE, d.controlled.symbol), *_draw_lines(view.check, place),
             axes(ylabel=f"{name_controlled(d)} [{d.controlled.shown_unit}]")]
 
 

@@ -90,15 +90,15 @@ def _flush_lines(lines: list[Line], console: Console, whole: Collection[str] = (
 
 def _print_table(table: Table, console: Console) -> None:
     rows = [[cell for cell in row if isinstance(cell, Cell)] for row in table.rows]  # all are, once columns are chosen
-    shown = rows[:table.terminal_rows]
-    needed = [_find_least_width(column, [row[i] for row in shown]) for i, column in enumerate(table.columns)]
-    for number, block in enumerate(_split_columns(needed, console.width)):
+    shown_rows = rows[:table.terminal_rows]
+    least_widths = [_find_least_width(column, [row[i] for row in shown_rows]) for i, column in enumerate(table.columns)]
+    for number, block in enumerate(_split_columns(least_widths, console.width)):
         console.print(_build_table([table.columns[i] for i in block],
-                                   [[row[i] for i in block] for row in shown
+                                   [[row[i] for i in block] for row in shown_rows
                                     if number == 0 or any(row[i].text for i in block[1:])],
-                                   [needed[i] for i in block], console.width))
-    if len(shown) < len(rows):
-        console.print(Text(f"and {len(rows) - len(shown)} more", "dim"))
+                                   [least_widths[i] for i in block], console.width))
+    if len(shown_rows) < len(rows):
+        console.print(Text(f"and {len(rows) - len(shown_rows)} more", "dim"))
     if table.caption:
         console.print(Text(table.caption, "dim italic"))
 
@@ -110,40 +110,40 @@ def _find_least_width(column: Column, cells: Sequence[Cell]) -> int:
     return max(map(cell_len, [*column.heading.split(), *texts]), default=0)
 
 
-def _split_columns(needed: Sequence[int], width: int) -> list[list[int]]:
+def _split_columns(least_widths: Sequence[int], width: int) -> list[list[int]]:
     """Numbers of the columns of each block that fits into `width` characters; each block begins with the first column.
 
     A single column that is wider than the console makes a block of its own.
     """
     blocks = [[0]]
-    for i in range(1, len(needed)):
-        if len(blocks[-1]) > 1 and sum(needed[j] + GAP for j in blocks[-1]) + needed[i] > width:
+    for i in range(1, len(least_widths)):
+        if len(blocks[-1]) > 1 and sum(least_widths[j] + GAP for j in blocks[-1]) + least_widths[i] > width:
             blocks.append([0])
         blocks[-1].append(i)
     return blocks
 
 
-def _build_table(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], needed: Sequence[int], width: int
+def _build_table(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], least_widths: Sequence[int], width: int
                  ) -> RichTable:
     out = RichTable(box=None, pad_edge=False, padding=(0, GAP, 0, 0), show_header=any(c.heading for c in columns))
-    for column, own in zip(columns, _choose_widths(columns, rows, needed, width), strict=True):
+    for column, column_width in zip(columns, _choose_widths(columns, rows, least_widths, width), strict=True):
         is_number = column.align == "right"
-        heading = textwrap.fill(column.heading, own, break_on_hyphens=False) if is_number else column.heading
-        out.add_column(Text(heading), justify=column.align, no_wrap=is_number, overflow="fold", width=own)
+        heading = textwrap.fill(column.heading, column_width, break_on_hyphens=False) if is_number else column.heading
+        out.add_column(Text(heading), justify=column.align, no_wrap=is_number, overflow="fold", width=column_width)
     for row in rows:
         out.add_row(*(Text(cell.text, style_of(cell)) for cell in row))
     return out
 
 
-def _choose_widths(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], needed: Sequence[int], width: int
+def _choose_widths(columns: Sequence[Column], rows: Sequence[Sequence[Cell]], least_widths: Sequence[int], width: int
                    ) -> list[int]:
     """Characters of each column: what it needs, and what it would like where the table has room for that.
 
     rich itself would shrink the widest column first, below the width of its longest word, and crop the table.
     """
-    spare = [max(0, *(cell_len(line) - needed[i] for row in rows for line in row[i].text.split("\n")),
-                 cell_len(column.heading) - needed[i]) for i, column in enumerate(columns)]
-    out, room = list(needed), max(0, width - sum(needed) - GAP * (len(columns) - 1))
+    spare = [max(0, *(cell_len(line) - least_widths[i] for row in rows for line in row[i].text.split("\n")),
+                 cell_len(column.heading) - least_widths[i]) for i, column in enumerate(columns)]
+    out, room = list(least_widths), max(0, width - sum(least_widths) - GAP * (len(columns) - 1))
     words = sorted((i for i, column in enumerate(columns) if column.align == "left"), key=lambda i: spare[i])
     numbers = [i for i, column in enumerate(columns) if column.align == "right"]
     for place, i in enumerate([*words, *numbers]):

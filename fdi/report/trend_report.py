@@ -86,25 +86,26 @@ def explain_level(trend: Trend) -> str:
 
 def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
     fault, _ = trend.stated
-    left, span = trend.remaining, float(trend.t[-1] - trend.t[0])
+    remaining_times, span = trend.remaining, float(trend.t[-1] - trend.t[0])
 
     def show_date(level: str, limit: str) -> str:
-        return "–" if left[level].high == 0.0 else _format_date(getattr(left[level], limit), unit)
+        return "–" if remaining_times[level].high == 0.0 else _format_date(getattr(remaining_times[level], limit), unit)
 
     items: list[Item] = [
         Line("level", explain_level(trend)),
         *(Line("" if i else "size", text) for i, text in enumerate(_describe_trend(trend, unit))),
         *(Line(f"{LIMIT_NAMES[level]} ({format_limit(fault.place_size(remaining.limit), fault.unit)})",
-               _describe_arrival(remaining, trend, unit), medium=Medium.TERMINAL) for level, remaining in left.items()),
+               _describe_arrival(remaining, trend, unit), medium=Medium.TERMINAL)
+          for level, remaining in remaining_times.items()),
         tabulate(
-            left, (Column("reaches"), lambda level: LIMIT_NAMES[level]),
+            remaining_times, (Column("reaches"), lambda level: LIMIT_NAMES[level]),
             (Column("time left (95 % interval)", align="right"),
-             lambda level: Cell(_describe_time_left(left[level], trend, unit), is_strong=True)),
+             lambda level: Cell(_describe_time_left(remaining_times[level], trend, unit), is_strong=True)),
             (Column("not before (97.5 %)", align="right"), lambda level: show_date(level, "low")),
             (Column("median", align="right"), lambda level: show_date(level, "value")),
             (Column("not after (97.5 %)", align="right"), lambda level: show_date(level, "high")),
             (Column("probability", align="right"),
-             lambda level: f"{100 * left[level].compute_probability_within(span):.0f} %"),
+             lambda level: f"{100 * remaining_times[level].compute_probability_within(span):.0f} %"),
             caption="Probability: that the limit is reached within a time as long as the traces cover.",
             medium=Medium.PAGE)]
     return Section(fault.title, items,
@@ -124,12 +125,12 @@ def _describe_trend(trend: Trend, unit: UnitTrend) -> list[str]:
     """What the traces say about one fault, a sentence each, the most important first."""
     points = unit.gathered.points[-len(trend.t):]
     is_cut = len(unit.gathered.points) > TREND_MOST_TRACES
-    ranked = sorted(trend.laws.items(), key=lambda item: -item[1]) if trend.verdict == "TREND" else []
-    laws = ", ".join(f"{law} {100 * p:.0f} %" for law, p in ranked if p >= 0.005)
+    laws = sorted(trend.laws.items(), key=lambda item: -item[1]) if trend.verdict == "TREND" else []
+    words = ", ".join(f"{law} {100 * p:.0f} %" for law, p in laws if p >= 0.005)
     return [_describe_growth(trend, unit),
             *(_describe_break(b, points[b.row], trend.stated[0], unit) for b in trend.breaks),
             *([f"only the latest {TREND_MOST_TRACES} traces are used"] if is_cut else []),
-            *([f"growth law: {laws}"] if laws else [])]
+            *([f"growth law: {words}"] if words else [])]
 
 
 def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
@@ -146,18 +147,18 @@ def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
             f"{format_interval(*Estimate(*(length * x for x in trend.rate)), fault.unit)} per {period}")
 
 
-def _describe_break(found: Break, point: Point, fault: Fault, unit: UnitTrend) -> str:
+def _describe_break(trend_break: Break, point: Point, fault: Fault, unit: UnitTrend) -> str:
     at = f"{point.trace}, {_collect_place(point.t, unit)}"
-    size = format_amount(abs(found.size), fault.unit, 2)
-    side = "above" if (found.size > 0) != fault.falls else "below"
-    meaning = ("an outlier, a step or faster growth; each gets a probability of one third" if found.size > 0 else
+    size = format_amount(abs(trend_break.size), fault.unit, 2)
+    side = "above" if (trend_break.size > 0) != fault.falls else "below"
+    meaning = ("an outlier, a step or faster growth; each gets a probability of one third" if trend_break.size > 0 else
                "an outlier or a repair; it is left out")
     words = {"outlier": f"outlier, left out: {at}, {size} {side} the other traces",
              "step": f"step: from {at} on, the size is {size} {'smaller' if fault.falls else 'larger'}",
              "repair": f"repair: at {at} the size {'rises' if fault.falls else 'drops'} by {size}; the trend starts "
                        "there",
              "last": f"the last trace is {size} {side} the others: {meaning}; another trace would decide"}
-    return words[found.kind]
+    return words[trend_break.kind]
 
 
 def _describe_time_left(remaining: Remaining, trend: Trend, unit: UnitTrend) -> str:
@@ -205,17 +206,17 @@ def _collect_data(unit: UnitTrend) -> dict[str, Any]:
 
 def _collect_trend(trend: Trend, unit: UnitTrend) -> dict[str, Any]:
     points, end = unit.gathered.points[-len(trend.t):], float(trend.t[-1])
-    remaining = {level: {
-        "limit": left.limit, "value": left.value, "low": left.low, "high": left.high,
+    remaining_times = {level: {
+        "limit": remaining.limit, "value": remaining.value, "low": remaining.low, "high": remaining.high,
         **{f"{name}_at": _collect_place(end + t, unit) if math.isfinite(t) else None
-           for name, t in (("value", left.value), ("low", left.low), ("high", left.high))},
-        "ever": left.compute_probability_within(1e300)} for level, left in trend.remaining.items()}
+           for name, t in (("value", remaining.value), ("low", remaining.low), ("high", remaining.high))},
+        "ever": remaining.compute_probability_within(1e300)} for level, remaining in trend.remaining.items()}
     return {"verdict": trend.verdict, "size": trend.fault.key, "unit": trend.fault.unit,
             "now": trend.now._asdict(), "rate": None if trend.rate is None else trend.rate._asdict(),
             "laws": {law: round(p, 4) for law, p in trend.laws.items()},
             "breaks": [{"kind": b.kind, "trace": points[b.row].trace, "t": points[b.row].t, "size": b.size}
                        for b in trend.breaks],
-            "used": int(trend.used.sum()), "remaining": remaining,
+            "used": int(trend.used.sum()), "remaining": remaining_times,
             "forecast": None if trend.future is None else trend.future._asdict(),
             "reason": explain_level(trend), "says": _describe_trend(trend, unit)}
 
@@ -245,10 +246,10 @@ def _draw_fault(trend: Trend, unit: UnitTrend) -> Panel:
             at = _convert_times(curve.t, unit)
             panel += [area(at, curve.low, curve.high, colour, alpha=0.15),
                       line(at, curve.middle, colour, name, 1.4, ls=style)]
-    panel += [call("errorbar", t[used], value[used], [(value - low)[used], (high - value)[used]], fmt="o", ms=4, lw=1,
+    panel += [call("errorbar", t[rows], value[rows], [(value - low)[rows], (high - value)[rows]], fmt="o", ms=4, lw=1,
                    color=colour, label=name)
-              for used, colour, name in ((trend.used, INK, "traces"), (~trend.used, COMMAND, "traces left out"))
-              if used.any()]
+              for rows, colour, name in ((trend.used, INK, "traces"), (~trend.used, COMMAND, "traces left out"))
+              if rows.any()]
     for name, limit, colour in (("maintenance", trend.fault.acceptable, AMBER),
                                 ("non_nominal", trend.fault.maintenance, RED)):
         panel += [level(limit, colour, style=":"),
@@ -260,13 +261,13 @@ def _draw_fault(trend: Trend, unit: UnitTrend) -> Panel:
 
 def _mark_arrival(trend: Trend, name: str, limit: float, colour: str, unit: UnitTrend) -> list[Mark]:
     """The 95 % interval of when a limit is reached, as a bar on its line; it ends at the edge of the figure."""
-    left, end = trend.remaining.get(name), float(trend.t[-1])
-    if left is None or trend.verdict != "TREND" or left.high == 0.0 or left.low == math.inf:
+    remaining, end = trend.remaining.get(name), float(trend.t[-1])
+    if remaining is None or trend.verdict != "TREND" or remaining.high == 0.0 or remaining.low == math.inf:
         return []
     last = max(end, trend.future.t[-1] if trend.future else -math.inf)
-    ends = _convert_times([min(end + x, last) for x in (left.low, left.high)], unit)
+    ends = _convert_times([min(end + x, last) for x in (remaining.low, remaining.high)], unit)
     bar = line(ends, [limit, limit], colour, width=4, alpha=0.6, solid_capstyle="butt")
-    median = _convert_times([end + left.value], unit) if end + left.value <= last else []
+    median = _convert_times([end + remaining.value], unit) if end + remaining.value <= last else []
     return [bar, *(dot(at, limit, colour, marker="D") for at in median)]
 
 
