@@ -102,8 +102,8 @@ def _sample_stratified_rows(weights: Floats, count: int, rng: np.random.Generato
 def _sample_positive_numbers(mean: Floats, deviation: Floats, uniform: Floats) -> Floats:
     """Normal numbers, truncated to positive ones."""
     below = ndtr(-mean / deviation)
-    drawn: Floats = mean + deviation * ndtri(np.clip(below + uniform * (1.0 - below), 1e-300, 1.0 - 1e-16))
-    return np.maximum(drawn, 0.0)
+    numbers: Floats = mean + deviation * ndtri(np.clip(below + uniform * (1.0 - below), 1e-300, 1.0 - 1e-16))
+    return np.maximum(numbers, 0.0)
 
 
 def _sample_wander(kind: str, strength: float, slope: Floats, rng: np.random.Generator) -> Floats:
@@ -174,18 +174,18 @@ class Posterior(NamedTuple):
 
     def compute_law_probabilities(self) -> dict[str, float]:
         """Probability of each law."""
-        found: dict[str, float] = {}
+        probabilities: dict[str, float] = {}
         for shape, weight in zip(self.shapes, self.weights.sum(axis=0), strict=True):
-            found[shape.law] = found.get(shape.law, 0.0) + float(weight)
-        return found
+            probabilities[shape.law] = probabilities.get(shape.law, 0.0) + float(weight)
+        return probabilities
 
 
 def fit_growth(data: Scaled) -> Posterior:
     """The posterior of a series of at least two times."""
-    every, _ = list_shapes()
-    g = evaluate_shapes(every, data.u)
-    return Posterior(every, tuple(_fit_part(data, g, noise, wander)
-                                  for noise in range(len(NOISES)) for wander in range(len(WANDERS))))
+    shapes, _ = list_shapes()
+    g = evaluate_shapes(shapes, data.u)
+    return Posterior(shapes, tuple(_fit_part(data, g, noise, wander)
+                                   for noise in range(len(NOISES)) for wander in range(len(WANDERS))))
 
 
 def compute_covariance(data: Scaled, noise: int, wander: int, loose: float = 10.0, narrowest: float = 1e-4) -> Floats:
@@ -196,8 +196,8 @@ def compute_covariance(data: Scaled, noise: int, wander: int, loose: float = 10.
     """
     common, factor = NOISES[noise]
     sigma = factor * np.maximum(data.sigma, narrowest)
-    own = np.where(np.isin(np.arange(len(sigma)), data.bounded), 1.0, 1.0 - common)
-    out: Floats = (np.diag(own * sigma ** 2) + OFFSET_PRIOR_SD ** 2
+    own_share = np.where(np.isin(np.arange(len(sigma)), data.bounded), 1.0, 1.0 - common)
+    out: Floats = (np.diag(own_share * sigma ** 2) + OFFSET_PRIOR_SD ** 2
                    + STEP_PRIOR_SD ** 2 * data.jumps.T @ data.jumps + compute_wander_covariance(wander, data.u, data.u))
     out[data.loose, data.loose] += loose ** 2
     return out
@@ -205,9 +205,9 @@ def compute_covariance(data: Scaled, noise: int, wander: int, loose: float = 10.
 
 def compute_shape_log_priors(noise: int, wander: int) -> Floats:
     """Log prior of each shape under a noise and a wander; a level that wanders is a trend, not `none`."""
-    every, prior = list_shapes()
-    constant = np.array([shape.law == "none" for shape in every])
-    chance = WANDER_PRIOR[wander] * np.ones(len(every))
+    shapes, prior = list_shapes()
+    constant = np.array([shape.law == "none" for shape in shapes])
+    chance = WANDER_PRIOR[wander] * np.ones(len(shapes))
     chance[constant] = WANDERS[wander][0] == "still"
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(chance * prior * NOISE_PRIOR[noise]))
@@ -228,15 +228,15 @@ def _fit_part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:
     end = _compute_end_covariance(data, wander)
     white = solve_triangular(factor, np.column_stack([data.y, g, end.T]), lower=True, check_finite=False)
     y, g, s = white[:, 0], white[:, 1:-2], white[:, -2:]
-    every, _ = list_shapes()
-    usual = np.array([shape.rise for shape in every])
+    shapes, _ = list_shapes()
+    usual = np.array([shape.rise for shape in shapes])
     precision = (g * g).sum(axis=0) + usual ** -2
     rise, deviation = (g.T @ y) / precision, precision ** -0.5
     evidence = (compute_shape_log_priors(noise, wander) - np.log(np.diag(factor)).sum() - 0.5 * y @ y
                 + compute_rise_evidence(rise, deviation, usual))
-    own = np.array([[OFFSET_PRIOR_SD ** 2 + len(data.steps) * STEP_PRIOR_SD ** 2, 0.0], [0.0, 0.0]])
-    wandered = np.array([[1.0, 1.5], [1.5, 3.0]]) if kind == "integrated" else np.diag([1.0, 0.0])
-    spread = own + strength ** 2 * wandered - s.T @ s
+    offset_spread = np.array([[OFFSET_PRIOR_SD ** 2 + len(data.steps) * STEP_PRIOR_SD ** 2, 0.0], [0.0, 0.0]])
+    wander_spread = np.array([[1.0, 1.5], [1.5, 3.0]]) if kind == "integrated" else np.diag([1.0, 0.0])
+    spread = offset_spread + strength ** 2 * wander_spread - s.T @ s
     return Part(noise, wander, evidence, rise, deviation, s.T @ y, s.T @ g, spread)
 
 
@@ -260,16 +260,16 @@ def estimate_level(data: Scaled, posterior: Posterior, u: Floats) -> Floats:
     best, shape = np.unravel_index(posterior.weights.argmax(), posterior.weights.shape)
     part = posterior.parts[best]
     g = evaluate_shapes((posterior.shapes[shape],), np.concatenate([data.u, u]))[:, 0]
-    here, there = g[:len(data.u)], g[len(data.u):]
+    growth_at_data, growth_at_u = g[:len(data.u)], g[len(data.u):]
     rise = max(float(part.rise[shape]), 0.0)
     solver = cho_factor(compute_covariance(data, part.noise, part.wander))
     jumps = np.array([u >= data.u[row] for row in data.steps], dtype=float).reshape(-1, len(u))  # as Scaled.jumps
     cross = _compute_cross_covariance(part.wander, u, jumps, data.u, data.jumps)
-    mean = rise * there + cross @ cho_solve(solver, data.y - rise * here)
-    pull = there - cross @ cho_solve(solver, here)
-    own = _compute_cross_covariance(part.wander, u, jumps, u, jumps).diagonal()
-    left = own - (cross * cho_solve(solver, cross.T).T).sum(axis=1)
-    half = INTERVAL_95_SD * np.sqrt(np.maximum(left + (pull * part.deviation[shape]) ** 2, 0.0))
+    mean = rise * growth_at_u + cross @ cho_solve(solver, data.y - rise * growth_at_data)
+    pull = growth_at_u - cross @ cho_solve(solver, growth_at_data)
+    prior_variance = _compute_cross_covariance(part.wander, u, jumps, u, jumps).diagonal()
+    variance = prior_variance - (cross * cho_solve(solver, cross.T).T).sum(axis=1)
+    half = INTERVAL_95_SD * np.sqrt(np.maximum(variance + (pull * part.deviation[shape]) ** 2, 0.0))
     return np.array([mean - half, mean, mean + half])
 
 
@@ -316,29 +316,29 @@ def list_shapes() -> tuple[tuple[Shape, ...], Floats]:
         late = len(table[law]) - early
         share = 0.5 if late else 1.0
         weights += [share / early if shape.onset <= 0.0 else 0.5 / late for shape in table[law]]
-    every = tuple(shape._replace(rise=rise) for rise in rises for shape in flat)
-    return every, np.tile(weights, len(rises)) / len(LAWS) / len(rises)
+    shapes = tuple(shape._replace(rise=rise) for rise in rises for shape in flat)
+    return shapes, np.tile(weights, len(rises)) / len(LAWS) / len(rises)
 
 
-def evaluate_shapes(every: tuple[Shape, ...], u: Floats, largest: float = 1e6) -> Floats:
+def evaluate_shapes(shapes: tuple[Shape, ...], u: Floats, largest: float = 1e6) -> Floats:
     """The shapes at times u, shape (m,): a matrix (m, k); steep ones stop at `largest`."""
-    return np.column_stack([_evaluate_shape(shape, u, largest) for shape in every])
+    return np.column_stack([_evaluate_shape(shape, u, largest) for shape in shapes])
 
 
 def _evaluate_shape(shape: Shape, u: Floats, largest: float) -> Floats:
     since = np.maximum(u - shape.onset, 0.0) / (1.0 - shape.onset)
     match shape.law:
         case "none":
-            grown = np.zeros_like(u)
+            growth = np.zeros_like(u)
         case "exponential":
             top = np.log(largest) + shape.bend
-            grown = np.expm1(np.minimum(shape.bend * since, top)) / np.expm1(shape.bend)
+            growth = np.expm1(np.minimum(shape.bend * since, top)) / np.expm1(shape.bend)
         case "runaway":
-            left = np.maximum(shape.bend - since, 1e-9)
-            grown = (1.0 / left - 1.0 / shape.bend) / (1.0 / (shape.bend - 1.0) - 1.0 / shape.bend)
+            distance = np.maximum(shape.bend - since, 1e-9)
+            growth = (1.0 / distance - 1.0 / shape.bend) / (1.0 / (shape.bend - 1.0) - 1.0 / shape.bend)
         case _:
-            grown = since ** shape.bend
-    return np.asarray(np.minimum(grown, largest))
+            growth = since ** shape.bend
+    return np.asarray(np.minimum(growth, largest))
 
 
 class Remaining(NamedTuple):
@@ -393,8 +393,8 @@ class Trend:
     @property
     def level(self) -> Level:
         """Level of the size now, by the rule of `rig fdi`; where its interval is too wide for that, by the value."""
-        found = judge_size(self.fault, self.now)
-        return classify_size(self.fault, self.now.value) if found is None else found
+        level = judge_size(self.fault, self.now)
+        return classify_size(self.fault, self.now.value) if level is None else level
 
 
 def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate]) -> Trend:
@@ -402,24 +402,25 @@ def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate
     t = np.array(times[-TREND_MOST_TRACES:], dtype=float)
     sizes = tuple(estimates[-TREND_MOST_TRACES:])
     data, unit = _scale_series(fault, t, sizes)
-    found = find_breaks(data) if t[-1] > t[0] else Cleaned(data, 0, ())
-    breaks = tuple(b._replace(size=b.size * unit) for b in found.breaks)
-    used = np.arange(len(t)) >= found.first
-    used[[found.first + row for row in found.data.loose]] = False
-    if used.sum() < TREND_FEWEST_TRACES or np.ptp(t[used]) == 0.0:
-        return Trend(fault, "TOO_FEW", t, sizes, used, breaks, {}, sizes[-1], None, {}, None, None)
-    span = float(t[-1] - t[found.first])
-    posterior = fit_growth(found.data)
-    paths, laws = _sample_paths(found, posterior, _fit_unit_error(data, used)), posterior.compute_law_probabilities()
-    remaining = {reached: Remaining(limit, *_summarise_draws(draws), draws)
-                 for reached, limit in (("maintenance", fault.acceptable), ("non_nominal", fault.maintenance))
+    series = find_breaks(data) if t[-1] > t[0] else Cleaned(data, 0, ())
+    breaks = tuple(b._replace(size=b.size * unit) for b in series.breaks)
+    is_used = np.arange(len(t)) >= series.first
+    is_used[[series.first + row for row in series.data.loose]] = False
+    if is_used.sum() < TREND_FEWEST_TRACES or np.ptp(t[is_used]) == 0.0:
+        return Trend(fault, "TOO_FEW", t, sizes, is_used, breaks, {}, sizes[-1], None, {}, None, None)
+    span = float(t[-1] - t[series.first])
+    posterior = fit_growth(series.data)
+    paths, laws = (_sample_paths(series, posterior, _fit_unit_error(data, is_used)),
+                   posterior.compute_law_probabilities())
+    remaining = {level_name: Remaining(limit, *_summarise_draws(draws), draws)
+                 for level_name, limit in (("maintenance", fault.acceptable), ("non_nominal", fault.maintenance))
                  for draws in [find_first_passage(paths, (limit - fault.healthy) / unit) * span]}
     middle = np.linspace(0.0, 1.0, 60)
-    level = fault.healthy + unit * estimate_level(found.data, posterior, middle)
-    past = Curve(t[found.first] + span * middle, *level)
+    level = fault.healthy + unit * estimate_level(series.data, posterior, middle)
+    past = Curve(t[series.first] + span * middle, *level)
     now = np.maximum(fault.healthy + unit * paths.sizes[:, 0], fault.range[0])
-    return Trend(fault, "TREND" if laws["none"] < NO_GROWTH_PROBABILITY else "NO_TREND", t, sizes, used, breaks, laws,
-                 _summarise_draws(now), _summarise_draws(paths.rate * unit / span), remaining, past,
+    return Trend(fault, "TREND" if laws["none"] < NO_GROWTH_PROBABILITY else "NO_TREND", t, sizes, is_used, breaks,
+                 laws, _summarise_draws(now), _summarise_draws(paths.rate * unit / span), remaining, past,
                  _make_forecast(fault, unit, paths, float(t[-1]), span))
 
 
@@ -433,27 +434,27 @@ def _scale_series(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[S
     return Scaled((t - t[0]) / span, (value - fault.healthy) / unit, sigma, bounded=bounded), unit
 
 
-def _fit_unit_error(data: Scaled, used: Flags) -> Floats:
+def _fit_unit_error(data: Scaled, is_used: Flags) -> Floats:
     """Standard deviation of a size by the unit's tolerances, common to all its traces: a polynomial of the size.
 
     A line through the intervals' deviations over the sizes; the last deviation where the sizes hardly differ.
     """
-    y, sigma = data.y[used], data.sigma[used]
+    y, sigma = data.y[is_used], data.sigma[is_used]
     if np.ptp(y) < INTERVAL_SLOPE_RANGE:
         return sigma[-1:]
     return np.polyfit(y, sigma, 1)
 
 
-def _sample_paths(found: Cleaned, posterior: Posterior, unit_error: Floats) -> Paths:
+def _sample_paths(series: Cleaned, posterior: Posterior, unit_error: Floats) -> Paths:
     """Paths from the last trace on.
 
     A last size that stands out above may be out of line, a step, or the law that turns up: a third of the paths each.
     """
-    last = found.breaks[-1] if found.breaks else None
+    last = series.breaks[-1] if series.breaks else None
     if last is None or last.kind != "last" or last.size < 0.0:
         return sample_paths(posterior, unit_error)
-    at = len(found.data.u) - 1
-    tight = found.data._replace(loose=tuple(row for row in found.data.loose if row != at))
+    at = len(series.data.u) - 1
+    tight = series.data._replace(loose=tuple(row for row in series.data.loose if row != at))
     third = TREND_PATHS // 3
     posteriors = posterior, fit_growth(tight._replace(steps=(*tight.steps, at))), fit_growth(tight)
     three = [sample_paths(p, unit_error, i, third) for i, p in enumerate(posteriors)]
@@ -468,9 +469,9 @@ def _summarise_draws(draws: Floats) -> Estimate:
 def _make_forecast(fault: Fault, unit: float, paths: Paths, start: float, span: float) -> Curve:
     """The sizes up to when most paths have reached MaxBand, at most twice the time seen so far."""
     until = float(np.quantile(find_first_passage(paths, 1.0), 0.5, method="nearest"))
-    shown = np.flatnonzero(min(max(1.5 * until, 0.3), 2.0) >= AHEAD)
-    low, middle, high = fault.healthy + unit * np.quantile(paths.sizes[:, shown], [0.025, 0.5, 0.975], axis=0)
-    return Curve(start + span * AHEAD[shown], low, middle, high)
+    columns = np.flatnonzero(min(max(1.5 * until, 0.3), 2.0) >= AHEAD)
+    low, middle, high = fault.healthy + unit * np.quantile(paths.sizes[:, columns], [0.025, 0.5, 0.975], axis=0)
+    return Curve(start + span * AHEAD[columns], low, middle, high)
 
 
 class Break(NamedTuple):
@@ -491,13 +492,13 @@ class Cleaned(NamedTuple):
 
 def find_breaks(data: Scaled) -> Cleaned:
     """Mark breaks one by one: an outlier becomes loose, a step gets a column, rows before a repair are dropped."""
-    first, found = 0, []
+    first, breaks = 0, []
     for _ in range(BREAK_MOST):
         strongest = _find_strongest_break(data) if len(data.u) - len(data.loose) >= BREAK_FEWEST_IN_LINE else None
         if strongest is None:
             break
         kind, at, size = strongest
-        found.append(Break(kind, first + at, size))
+        breaks.append(Break(kind, first + at, size))
         match kind:
             case "step":
                 data = data._replace(steps=(*data.steps, at))
@@ -505,7 +506,7 @@ def find_breaks(data: Scaled) -> Cleaned:
                 data, first = _cut_before(data, at), first + at
             case _:
                 data = data._replace(loose=(*data.loose, at))
-    return Cleaned(data, first, tuple(sorted(found, key=lambda b: b.row)))
+    return Cleaned(data, first, tuple(sorted(breaks, key=lambda b: b.row)))
 
 
 def _cut_before(data: Scaled, at: int) -> Scaled:
@@ -535,14 +536,14 @@ def _find_strongest_break(data: Scaled) -> tuple[str, int, float] | None:
 
 def _compute_gains(data: Scaled, v: Floats) -> tuple[Floats, Floats]:
     """Log evidence that each column of v, shape (n, m), adds, and its factor under the best law: shape (m,) both."""
-    every, _ = list_shapes()
-    g = evaluate_shapes(every, data.u)
-    usual = np.array([shape.rise for shape in every])
+    shapes, _ = list_shapes()
+    g = evaluate_shapes(shapes, data.u)
+    usual = np.array([shape.rise for shape in shapes])
     plain, with_it, factors = [], [], []
     for i, j in product(range(len(NOISES)), range(len(WANDERS))):
         factor = np.linalg.cholesky(compute_covariance(data, i, j))
         white = solve_triangular(factor, np.column_stack([data.y, g, v]), lower=True, check_finite=False)
-        y, rises, columns = white[:, 0], white[:, 1:1 + len(every)], white[:, 1 + len(every):]
+        y, rises, columns = white[:, 0], white[:, 1:1 + len(shapes)], white[:, 1 + len(shapes):]
         chance = compute_shape_log_priors(i, j) - np.log(np.diag(factor)).sum() - 0.5 * y @ y
         alone, both, size = _compute_evidence(y, rises, columns, usual)
         plain.append(chance + alone)
@@ -559,8 +560,8 @@ def _compute_evidence(y: Floats, g: Floats, v: Floats, usual: Floats) -> tuple[F
     gg, vv, gv = (g * g).sum(axis=0) + usual ** -2, (v * v).sum(axis=0) + STEP_PRIOR_SD ** -2, g.T @ v
     gy, vy = g.T @ y, v.T @ y
     alone = compute_rise_evidence(gy / gg, gg ** -0.5, usual)
-    left = gg[:, None] - gv ** 2 / vv  # of the rise, the factor taken out
+    precision = gg[:, None] - gv ** 2 / vv  # of the rise, the factor taken out
     rest = gy[:, None] - gv * (vy / vv)
     both = (0.5 * vy ** 2 / vv - 0.5 * np.log(vv * STEP_PRIOR_SD ** 2)
-            + compute_rise_evidence(rest / left, left ** -0.5, usual[:, None]))
-    return alone, both, (vy - gv * np.maximum(rest / left, 0.0)) / vv
+            + compute_rise_evidence(rest / precision, precision ** -0.5, usual[:, None]))
+    return alone, both, (vy - gv * np.maximum(rest / precision, 0.0)) / vv

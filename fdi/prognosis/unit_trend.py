@@ -61,8 +61,8 @@ def read_points(path: Path, faults: Sequence[Fault] | None = None) -> Gathered:
     """
     try:
         answer = json.loads(path.read_text(encoding="utf-8"))
-        own = tuple(Fault(**table) for table in answer.get("faults", ()))
-        faults = tuple(faults or own or FAULTS)
+        stored_faults = tuple(Fault(**table) for table in answer.get("faults", ()))
+        faults = tuple(faults or stored_faults or FAULTS)
         points = tuple(Point(str(p["trace"]), float(p["t"]), {
             f.name: Estimate(*(float(p[f.key][name]) for name in Estimate._fields)) for f in faults},
             str(p.get("note", ""))) for p in answer["points"])
@@ -124,9 +124,9 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
         except InputError as error:
             notes.append(f"{name} left out: {str(error).removeprefix(f'{file}: ')}")
     axis = _choose_axis(folder, rows, axis)  # before the work: a trace without a date is refused at once
-    found = [find_row(dates, name) for name in names.values()]
+    matches = [find_row(dates, name) for name in names.values()]
     notes += [f"{key} is listed in {place.name}, but there is no such trace" for key, row in dates.items()
-              if not any(row is own for own in found)]  # two traces may have equal rows
+              if not any(row is match for match in matches)]  # two traces may have equal rows
     points = []
     for i, (file, row) in enumerate(rows.items()):
         progress(f"trace {i + 1} of {len(rows)}", i / len(rows))
@@ -150,28 +150,28 @@ def list_traces(folder: Path) -> list[Path]:
         InputError: no folder, or no such file.
     """
     require(folder.is_dir(), folder, "", "a folder of dated traces, or the JSON file of an earlier answer")
-    found = sorted(path for path in folder.rglob("*") if path.name.endswith(ENDINGS) and path.name != TABLE
+    paths = sorted(path for path in folder.rglob("*") if path.name.endswith(ENDINGS) and path.name != TABLE
                    and not any(part.startswith(".") for part in path.relative_to(folder).parts))
-    require(found, folder, "", "traces in it: .mcap, .csv or .csv.gz")
-    return found
+    require(paths, folder, "", "traces in it: .mcap, .csv or .csv.gz")
+    return paths
 
 
-def _date_trace(folder: Path, name: str, own: str, row: Row | None) -> Row:
+def _date_trace(folder: Path, name: str, start_time: str, row: Row | None) -> Row:
     """The place of a trace on each axis: by the table, else by its own start time, else by its name."""
     row = row or dict.fromkeys(AXES, math.nan)
     if not math.isnan(row["date"]):
         return row
-    day = parse_date(own)
+    day = parse_date(start_time)
     return {**row, "date": find_date_in_name(Path(folder.resolve().name) / name) if math.isnan(day) else day}
 
 
-def _choose_axis(folder: Path, rows: Mapping[Path, Row], wanted: str | None) -> str:
+def _choose_axis(folder: Path, rows: Mapping[Path, Row], choice: str | None) -> str:
     """The axis asked for, or the first on which every trace has a place."""
     without = {axis: [file for file, row in rows.items() if math.isnan(row[axis])] for axis in AXES}
-    for axis in (wanted,) if wanted else AXES:
+    for axis in (choice,) if choice else AXES:
         if not without[axis]:
             return axis
-    missing = wanted or "date"
+    missing = choice or "date"
     expected = f"a line in {folder / TABLE} with a column {missing}" if missing != "date" else (
         "a start time in the log, an ISO date in the name of file or folder (2026-01-31), or a line in "
         f"{folder / TABLE} (file,date)")
@@ -184,8 +184,8 @@ def read_start_time(file: Path, model: Model, again: bool = False, faults: Seque
     Raises:
         InputError: a file that is not a trace.
     """
-    if (found := _read_answer(_find_answer_file(file, model, faults), again)) is not None:
-        return str(found["started"])
+    if (answer := _read_answer(_find_answer_file(file, model, faults), again)) is not None:
+        return str(answer["started"])
     return Trace.read(file, signals=model.kind.signals).provenance.get("started", "")
 
 
@@ -196,36 +196,36 @@ def diagnose_once(file: Path, model: Model, again: bool = False, faults: Sequenc
         InputError: a trace that cannot be judged; this answer is not stored.
     """
     place = _find_answer_file(file, model, faults)
-    found = _read_answer(place, again)
-    if found is None:
+    answer = _read_answer(place, again)
+    if answer is None:
         from fdi.diagnosis.diagnosis import diagnose
 
         trace = Trace.read(file, signals=model.kind.signals)
         d = diagnose(trace, model, source=str(file), faults=faults)
-        found = {"started": trace.provenance.get("started", ""),
-                 "sizes": {name: list(size) for name, size in d.sizes.items()},
-                 "note": "something else is wrong" if d.verdict == "SOMETHING_ELSE" else ""}
+        answer = {"started": trace.provenance.get("started", ""),
+                  "sizes": {name: list(size) for name, size in d.sizes.items()},
+                  "note": "something else is wrong" if d.verdict == "SOMETHING_ELSE" else ""}
         with contextlib.suppress(OSError, InputError):  # an answer that cannot be kept is found again next time
             place.parent.mkdir(parents=True, exist_ok=True)
-            write_text(place, json.dumps(found), "the cache of answers")
-    return found
+            write_text(place, json.dumps(answer), "the cache of answers")
+    return answer
 
 
 def _read_answer(place: Path, again: bool) -> dict[str, Any] | None:
     """The answer stored there; None if there is none, or it is not wanted again."""
     if again or not place.is_file():
         return None
-    found: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
-    return found
+    answer: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
+    return answer
 
 
 def _find_answer_file(file: Path, model: Model, faults: Sequence[Fault]) -> Path:
     """File for the answer of a trace: its name is a hash of the trace, the model, the faults and the code."""
     with report_unreadable(file, "UTF-8"):
         content = file.read_bytes()
-    theirs = {f for e in model.effects if (f := model.find_effect(e).file)}
-    own = [hashlib.sha256(Path(f).read_bytes()).hexdigest() for f in sorted(theirs)]
-    text = json.dumps([sorted(model.values.items()), model.effects, own, model.plant, hash_sources("plant", "fdi"),
+    effect_files = {f for e in model.effects if (f := model.find_effect(e).file)}
+    hashes = [hashlib.sha256(Path(f).read_bytes()).hexdigest() for f in sorted(effect_files)]
+    text = json.dumps([sorted(model.values.items()), model.effects, hashes, model.plant, hash_sources("plant", "fdi"),
                        [asdict(fault) for fault in faults]])
     return find_cache_folder() / "trend" / f"{hashlib.sha256(content + text.encode()).hexdigest()[:32]}.json"
 
@@ -243,10 +243,10 @@ def parse_date(text: str) -> float:
     (1.0, 1.0, nan)
     """
     try:
-        found = datetime.fromisoformat(text.strip())
+        date = datetime.fromisoformat(text.strip())
     except ValueError:
         return math.nan
-    return found.replace(microsecond=0, tzinfo=found.tzinfo or UTC).timestamp() / 86400
+    return date.replace(microsecond=0, tzinfo=date.tzinfo or UTC).timestamp() / 86400
 
 
 def format_day(day: float, with_time: bool = False) -> str:
@@ -264,9 +264,9 @@ def find_date_in_name(path: Path) -> float:
     >>> find_date_in_name(Path("unit7/2026-01-02/trace.mcap")) - parse_date("2026-01-01")
     1.0
     """
-    found = (parse_date(f"{y}-{m}-{d}" + ("T" + ":".join(word or "00" for word in clock) if clock[0] else ""))
-             for part in reversed(path.parts) for y, m, d, *clock in _DATE.findall(part))
-    return next((day for day in found if not math.isnan(day)), math.nan)
+    days = (parse_date(f"{y}-{m}-{d}" + ("T" + ":".join(word or "00" for word in clock) if clock[0] else ""))
+            for part in reversed(path.parts) for y, m, d, *clock in _DATE.findall(part))
+    return next((day for day in days if not math.isnan(day)), math.nan)
 
 
 def read_dates_table(path: Path) -> dict[str, Row]:
@@ -281,15 +281,15 @@ def read_dates_table(path: Path) -> dict[str, Row]:
         raise InputError(path, "", f"a table file,date ({error})") from error
     head = [word.strip().lower() for word in rows[0]] if rows else []
     require("file" in head and set(AXES) & set(head), path, "header", "file and one or more of date, hours, flights")
-    found: dict[str, Row] = {}
+    table: dict[str, Row] = {}
     for number, words in enumerate(rows[1:], 2):
         cells = dict(zip(head, (word.strip() for word in words), strict=False))
         name = cells.get("file", "").removeprefix("./")
         if not name:
             continue
-        require(name not in found, f"{path}: line {number}", "file", f"each file once, not {name} again")
-        found[name] = {axis: _read_cell(f"{path}: line {number}", axis, cells.get(axis, "")) for axis in AXES}
-    return found
+        require(name not in table, f"{path}: line {number}", "file", f"each file once, not {name} again")
+        table[name] = {axis: _read_cell(f"{path}: line {number}", axis, cells.get(axis, "")) for axis in AXES}
+    return table
 
 
 def _read_cell(where: str, axis: str, text: str) -> float:
