@@ -96,11 +96,11 @@ class Result:
             InputError: a title that is not one of `figures`, or a figure that this trace leaves empty.
         """
         figures = self._list_figures()
-        chosen = [figure for known, figure in figures if title in (None, known)]
-        if not chosen:
+        matches = [figure for figure_title, figure in figures if title in (None, figure_title)]
+        if not matches:
             known_titles = f"one of {', '.join(self.figures)}" if figures else "a result with figures"
             raise InputError("plot", title or "", known_titles)
-        for figure in chosen:
+        for figure in matches:
             if svg := figure.draw():
                 return Plot(svg, figure.caption)
         raise InputError("plot", title or "", "a figure for which the trace has data")
@@ -242,9 +242,9 @@ def compare(trace: TraceOrPath, model: ModelOrPath = "eha", *, repeats: Sequence
     from fdi.comparison.compare import compare as compare_trace
 
     own_model = _load_model(model, trust)
-    measured = _load_trace(trace, own_model)
-    comparison = compare_trace(measured, own_model, [_load_trace(r, own_model) for r in repeats], signals,
-                               source=measured.provenance.get("source", "trace"))
+    run = _load_trace(trace, own_model)
+    comparison = compare_trace(run, own_model, [_load_trace(r, own_model) for r in repeats], signals,
+                               source=run.provenance.get("source", "trace"))
     return ComparisonResult(fdi.report.build_comparison_report(comparison), comparison)
 
 
@@ -295,9 +295,9 @@ def add_effect(effect: str | Sequence[str], trace: TraceOrPath, model: ModelOrPa
     from fdi.discovery.update_model import add_effects, remove_all_effects
 
     effects = [effect] if isinstance(effect, str) else list(effect)
-    own_model, known = _load_model_file(model, trust)
-    runs = _collect_runs(remove_all_effects(own_model, known), trace, repeats, holdout, signals)
-    update = add_effects(effects, runs, own_model, known, f"fdi.add_effect({', '.join(map(repr, effects))})")
+    own_model, provenance = _load_model_file(model, trust)
+    runs = _collect_runs(remove_all_effects(own_model, provenance), trace, repeats, holdout, signals)
+    update = add_effects(effects, runs, own_model, provenance, f"fdi.add_effect({', '.join(map(repr, effects))})")
     return ModelResult(fdi.report.build_model_report(update), update)
 
 
@@ -329,11 +329,11 @@ def identify(runs: TraceOrPath | Sequence[TraceOrPath], model: ModelOrPath = "eh
     own_model = _load_model(model, trust)
     source = None if isinstance(model, Model) else model
     ranges = read_free_parameters(own_model, source) if free is None else parse_free_parameters(free, own_model, "free")
-    fitted = [runs] if isinstance(runs, Trace | str | Path) else runs
-    own = read_identification_runs(own_model, ranges, [_pass_run(r) for r in fitted],
-                                   [_pass_run(r) for r in holdouts], signals)
-    found = identify_model(own.model, ranges, own.fitted, own.held_out, own.sources, seed)
-    return IdentificationResult(fdi.report.build_identification_report(found, own_model.name), found)
+    fitted_runs = [runs] if isinstance(runs, Trace | str | Path) else runs
+    own_runs = read_identification_runs(own_model, ranges, [_pass_run(r) for r in fitted_runs],
+                                        [_pass_run(r) for r in holdouts], signals)
+    identification = identify_model(own_runs.model, ranges, own_runs.fitted, own_runs.held_out, own_runs.sources, seed)
+    return IdentificationResult(fdi.report.build_identification_report(identification, own_model.name), identification)
 
 
 def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Path | None = None,
@@ -356,8 +356,8 @@ def diagnose(trace: TraceOrPath, model: ModelOrPath = "eha", *, bands: str | Pat
 
     own_model = _load_model(model, trust)
     known_bands = None if bands is None else load_bands(bands, own_model.kind)
-    measured = _load_trace(trace, own_model)
-    diagnosis = diagnose_trace(measured, own_model, known_bands, source=measured.provenance.get("source", "trace"),
+    run = _load_trace(trace, own_model)
+    diagnosis = diagnose_trace(run, own_model, known_bands, source=run.provenance.get("source", "trace"),
                                faults=choose_faults(faults, own_model.kind))
     return DiagnosisResult(fdi.report.build_diagnosis_report(diagnosis), diagnosis)
 
@@ -366,8 +366,8 @@ def _load_trace(trace: TraceOrPath, model: Model) -> Trace:
     """A trace of the plant of `model`; one that was read gets the name of its file, so that messages can say it."""
     if isinstance(trace, Trace):
         return trace
-    found = Trace.read(trace, signals=model.kind.signals)
-    return replace(found, provenance={**found.provenance, "source": str(trace)})
+    run = Trace.read(trace, signals=model.kind.signals)
+    return replace(run, provenance={**run.provenance, "source": str(trace)})
 
 
 def _load_model(model: ModelOrPath, trust: bool) -> Model:

@@ -41,14 +41,14 @@ def require_trust(origin: object, codes: Sequence[ForeignCode], *, is_trusted: b
         InputError: the user has not said that it may run. Nothing has run then.
     """
     if codes and not is_trusted:
-        listed = ", ".join(f"{code.name} (SHA-256 {code.sha256})" for code in codes)
-        raise InputError(origin, "", f"--trust, because it brings code along that would run here: {listed}")
+        listing = ", ".join(f"{code.name} (SHA-256 {code.sha256})" for code in codes)
+        raise InputError(origin, "", f"--trust, because it brings code along that would run here: {listing}")
     for code in codes:
         announce(escape_control_characters(
             f"trusted code: {code.name}, {len(code.content)} bytes, from {origin}, SHA-256 {code.sha256}"))
 
 
-def load_effects_of_model(model: str | Path | None, given: Sequence[Path] = (), *, is_trusted: bool,
+def load_effects_of_model(model: str | Path | None, user_files: Sequence[Path] = (), *, is_trusted: bool,
                           announce: Announce = print_on_standard_error) -> tuple[Path, ...]:
     """Run the effect files that a model file names, if the user trusts them.
 
@@ -57,7 +57,7 @@ def load_effects_of_model(model: str | Path | None, given: Sequence[Path] = (), 
 
     Args:
         model: a model file; None or the name of a shipped model has no such files.
-        given: effect files that the user has named himself; each replaces one of the same name.
+        user_files: effect files that the user has named himself; each replaces one of the same name.
         is_trusted: whether the user lets this code run.
         announce: gets a line about each file before it runs.
 
@@ -67,13 +67,13 @@ def load_effects_of_model(model: str | Path | None, given: Sequence[Path] = (), 
     Raises:
         InputError: there are such files and the user does not trust them, or one of them cannot be used.
     """
-    loaded = {effect.file for effect in CATALOGUE.list_all().values()}  # as each file is now or was before
-    found = [path for path in find_effect_files(model, given) if path.absolute() not in loaded]
-    codes = [ForeignCode(str(path), read_file(path)) for path in found]
+    loaded_files = {effect.file for effect in CATALOGUE.list_all().values()}  # as each file is now or was before
+    paths = [path for path in find_effect_files(model, user_files) if path.absolute() not in loaded_files]
+    codes = [ForeignCode(str(path), read_file(path)) for path in paths]
     require_trust(model, codes, is_trusted=is_trusted, announce=announce)
-    for path, code in zip(found, codes, strict=True):
+    for path, code in zip(paths, codes, strict=True):
         load_effects(path, code.content)
-    return tuple(found)
+    return tuple(paths)
 
 
 def load_plant_of_model(model: str | Path | None, *, is_trusted: bool,
@@ -89,18 +89,18 @@ def load_plant_of_model(model: str | Path | None, *, is_trusted: bool,
     if path.suffix == ".py":
         load_plant(path)
     elif path.suffix == ".toml" and path.is_file():
-        named: Any = read_toml(path).get("plant")
-        if not isinstance(named, str) or not named.endswith(".py"):
+        name: Any = read_toml(path).get("plant")
+        if not isinstance(name, str) or not name.endswith(".py"):
             return
-        places = [place for place in (path.parent / named, Path(named)) if place.is_file()]
-        require(places, path, "plant", f"a file that exists, not {named!r}")
+        places = [place for place in (path.parent / name, Path(name)) if place.is_file()]
+        require(places, path, "plant", f"a file that exists, not {name!r}")
         code = ForeignCode(str(places[0]), read_file(places[0]))
         require_trust(path, [code], is_trusted=is_trusted, announce=announce)
         load_plant(places[0], code.content)
 
 
-def find_effect_files(model: str | Path | None, given: Sequence[Path] = ()) -> list[Path]:
-    """The effect files that a model file names and that exist, without those of the same name as one in `given`.
+def find_effect_files(model: str | Path | None, user_files: Sequence[Path] = ()) -> list[Path]:
+    """The effect files that a model file names and that exist, without those of the same name as one in `user_files`.
 
     Raises:
         InputError: the model file cannot be read.
@@ -111,8 +111,8 @@ def find_effect_files(model: str | Path | None, given: Sequence[Path] = ()) -> l
     names = provenance.get("effect_files", []) if isinstance(provenance, Mapping) else []
     files = [Path(name) for name in names if isinstance(name, str) and "\0" not in name]
     places = [next((p for p in (file, Path(model).parent / file) if p.is_file()), None) for file in files]
-    replaced = {file.name for file in given}
-    return list(dict.fromkeys(path for path in places if path is not None and path.name not in replaced))
+    replaced_names = {file.name for file in user_files}
+    return list(dict.fromkeys(path for path in places if path is not None and path.name not in replaced_names))
 
 
 def require_different_names(files: Sequence[Path]) -> None:

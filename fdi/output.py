@@ -14,12 +14,12 @@ def require_writable(out: str | Path, option: str, *, source: str | Path | None 
     Folders are not made. Raises InputError for a place that cannot be written, and for the `source` itself.
     """
     path = Path(out)
-    there = path.exists()
-    if there and source is not None and Path(source).exists() and path.samefile(source):
+    is_present = path.exists()
+    if is_present and source is not None and Path(source).exists() and path.samefile(source):
         raise InputError(option, str(path), "another file than the one that is read")
     with report_system_error(option, str(path), "a place that can be written"):
         path.open("ab").close()
-    if not there:
+    if not is_present:
         path.unlink()
     return path
 

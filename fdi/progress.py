@@ -27,8 +27,8 @@ class Stage:
 
     def finish_step(self) -> None:
         """Report that a step is done."""
-        done = min(next(self._numbers) / self._steps, 1.0)
-        self._progress(self._name, self._begin + (self._end - self._begin) * done)
+        share = min(next(self._numbers) / self._steps, 1.0)
+        self._progress(self._name, self._begin + (self._end - self._begin) * share)
 
 
 NO_STAGE = Stage(ignore_progress, "", 0.0, 0.0, 1)

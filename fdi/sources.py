@@ -25,23 +25,23 @@ def import_function(name: str, field: str, expected: str) -> Callable[..., Any]:
     Raises:
         InputError: there is no such function; the message names `field` and what was `expected`.
     """
-    module, _, function = name.partition(":")
+    module, _, attribute = name.partition(":")
     try:
-        found = getattr(importlib.import_module(module), function)
+        function = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise InputError(field, name, f"module:function of {expected} ({error})") from None
-    require(callable(found), field, name, f"module:function of {expected}")
-    return found  # type: ignore[no-any-return]
+    require(callable(function), field, name, f"module:function of {expected}")
+    return function  # type: ignore[no-any-return]
 
 
 @cache
 def hash_sources(*places: str) -> str:
     """A hash, 16 hexadecimal digits, of all code and data in packages and files: "plant", "studies/hidden_effects"."""
-    known = hashlib.sha256()
+    digest = hashlib.sha256()
     for place in places:
         package, *rest = place.split("/")
         path = Path(str(files(package).joinpath(*rest)))
         for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
             if file.suffix in SUFFIXES:
-                known.update(f"{place}/{file.relative_to(path).as_posix()}\0".encode() + file.read_bytes() + b"\0")
-    return known.hexdigest()[:16]
+                digest.update(f"{place}/{file.relative_to(path).as_posix()}\0".encode() + file.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
