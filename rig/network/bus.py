@@ -81,10 +81,10 @@ class EmbeddedBus:
         """Deliver the queued frames, with time `t_ns`, to all nodes but their senders until no node sends any more."""
         queue = self._queue
         while queue:
-            own, cob_id, data = queue.popleft()
+            sender, cob_id, data = queue.popleft()
             frame = Frame(t_ns, cob_id & ~SWITCHED, data)
             for receive in self._receivers:
-                if receive is not own:
+                if receive is not sender:
                     receive(frame)
 
 
@@ -95,16 +95,16 @@ def choose_bus(spec: str = "auto") -> tuple[str, str]:
     InputError for an unknown spec, RigError for a CAN interface that does not exist, also when the variable
     names it: a run on hardware must not fall back to the simulation and pass.
     """
-    configured = os.environ.get(BUS_VARIABLE, "")
-    if spec == "auto" and configured in ("", "auto"):
-        live = list_can_interfaces()
-        unasked = f"; {', '.join(live)} up, but not taken unasked" if live else ""
-        return "embedded", f"embedded bus (neither --bus nor {BUS_VARIABLE} is set){unasked}"
-    where, taken = (BUS_VARIABLE, configured) if spec == "auto" else ("--bus", spec)
-    kind, channel = parse_spec(taken, where)
+    default_bus = os.environ.get(BUS_VARIABLE, "")
+    if spec == "auto" and default_bus in ("", "auto"):
+        interfaces = list_can_interfaces()
+        hint = f"; {', '.join(interfaces)} up, but not taken unasked" if interfaces else ""
+        return "embedded", f"embedded bus (neither --bus nor {BUS_VARIABLE} is set){hint}"
+    where, choice = (BUS_VARIABLE, default_bus) if spec == "auto" else ("--bus", spec)
+    kind, channel = parse_spec(choice, where)
     if kind == "socketcan":
         require_interface(channel)
-    return taken, f"{taken}, as {BUS_VARIABLE} says" if where == BUS_VARIABLE else f"{taken}, as asked"
+    return choice, f"{choice}, as {BUS_VARIABLE} says" if where == BUS_VARIABLE else f"{choice}, as asked"
 
 
 def open_can(spec: str, bitrate: int = BITRATE, fd: bool = False) -> can.BusABC:
@@ -336,10 +336,10 @@ class Link:
         for _ in range(3):
             before = self._clock()
             wall = time.time_ns()
-            taken = self._clock() - before
-            if taken < shortest:
-                epoch, shortest = wall - before - taken // 2, taken
-            if taken < 50_000:
+            duration = self._clock() - before
+            if duration < shortest:
+                epoch, shortest = wall - before - duration // 2, duration
+            if duration < 50_000:
                 break
         return epoch
 
@@ -441,9 +441,9 @@ class LinkWire(Wire):
         """See `Wire`. What has come when the time is over counts: this program may have stood still meanwhile."""
         end = self.clock.now() + round(seconds * 1e9)
         while not done():
-            left = end - self.clock.now()
-            self.poll(min(max(left, 0) * 1e-9, 0.05))
-            if left <= 0:
+            remaining_ns = end - self.clock.now()
+            self.poll(min(max(remaining_ns, 0) * 1e-9, 0.05))
+            if remaining_ns <= 0:
                 return done()
         return True
 
@@ -461,8 +461,8 @@ class LinkWire(Wire):
     def run_until(self, t_ns: int) -> None:
         """See `Wire`."""
         self.poll(0.0)
-        while (left := t_ns - self.clock.now()) > 0:
-            self.poll(left * 1e-9)
+        while (remaining_ns := t_ns - self.clock.now()) > 0:
+            self.poll(remaining_ns * 1e-9)
 
     def hear_all(self) -> None:
         """See `Wire`."""

@@ -97,5 +97,5 @@ class WallClock:
 
     def sleep_until(self, t_ns: int) -> None:
         """Sleep until `t_ns`. CPython sleeps to an absolute deadline, so a long run does not drift."""
-        if (left := t_ns - self.now()) > 0:
-            time.sleep(left * 1e-9)
+        if (remaining_ns := t_ns - self.now()) > 0:
+            time.sleep(remaining_ns * 1e-9)

@@ -43,9 +43,9 @@ class HeartbeatConsumer:
     Watching a node begins with its first heartbeat, as the standard has it; a boot-up counts as a sign of life.
     """
 
-    def __init__(self, lost: Callable[[int], None], back: Callable[[int], None]) -> None:
-        """`lost(node)` when one falls silent, `back(node)` when it is heard for the first time or again."""
-        self._lost, self._back = lost, back
+    def __init__(self, on_lost: Callable[[int], None], on_back: Callable[[int], None]) -> None:
+        """`on_lost(node)` when one falls silent, `on_back(node)` when it is heard for the first time or again."""
+        self._on_lost, self._on_back = on_lost, on_back
         self._limits: dict[int, int] = {}  # node -> ns
         self._deadlines: dict[int, int] = {}  # of the nodes heard
 
@@ -64,7 +64,7 @@ class HeartbeatConsumer:
     def receive(self, frame: Frame) -> None:
         node = frame.cob_id - COB_ID
         if node not in self._deadlines:
-            self._back(node)
+            self._on_back(node)
         self._deadlines[node] = frame.t_ns + self._limits[node]
 
     def find_due(self) -> int:
@@ -74,4 +74,4 @@ class HeartbeatConsumer:
     def tick(self, t_ns: int) -> None:
         for node in [node for node, deadline in self._deadlines.items() if t_ns > deadline]:
             del self._deadlines[node]
-            self._lost(node)
+            self._on_lost(node)

@@ -72,12 +72,12 @@ class _Node(canopen.RemoteNode):
 class _Network(canopen.Network):
     """The library's network on our wire."""
 
-    def __init__(self, wire: Wire, sent: Callable[[int, bytes], None]) -> None:
+    def __init__(self, wire: Wire, send: Callable[[int, bytes], None]) -> None:
         super().__init__()
-        self.wire, self._sent = wire, sent
+        self.wire, self._send = wire, send
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        self._sent(can_id, bytes(data))
+        self._send(can_id, bytes(data))
 
 
 class Hooks:
@@ -123,8 +123,9 @@ class Master:
         self._watch = HeartbeatConsumer(lambda node: self.hooks.on_lost(self._roles[node]),
                                         lambda node: self.hooks.on_back(self._roles[node]))
         self._state = NmtState.PRE_OPERATIONAL
-        ours = {spec.identifier for spec in bench.frames.list_from(Role.RIG)} | {bench.frames.sync}
-        self._ours = ours | ({NMT, HEARTBEAT_ID + bench.rig_node} if bench.nodes else set())  # only the rig sends them
+        identifiers = {spec.identifier for spec in bench.frames.list_from(Role.RIG)} | {bench.frames.sync}
+        # only the rig sends them
+        self._ours = identifiers | ({NMT, HEARTBEAT_ID + bench.rig_node} if bench.nodes else set())
         # What the library may see, and the only length at which that is what it seems: it unpacks without looking.
         self._services = {base + node: length for base, length in ((EMCY, 8), (SDO_ANSWER, 8), (HEARTBEAT_ID, 1))
                           for node in self._roles}
@@ -283,10 +284,10 @@ class Master:
             return
         for index, sub, value, mask in objects:
             data = self._upload(role, index, sub)
-            found = value if data is None else int.from_bytes(data[:8], "little")
-            if (found ^ value) & mask:
+            device_value = value if data is None else int.from_bytes(data[:8], "little")
+            if (device_value ^ value) & mask:
                 raise InputError(self._bench.read_data_sheet(role)[0], name_object(index, sub),
-                                 f"0x{value:X}, but {self._bench.describe_node(role)} has 0x{found:X}")
+                                 f"0x{value:X}, but {self._bench.describe_node(role)} has 0x{device_value:X}")
 
     def configure(self, scenario: bytes, parameters: Mapping[str, float] | None, sync_period_us: int,
                   limit_ms: int = HEARTBEAT_LIMIT) -> None:
@@ -326,13 +327,13 @@ class Master:
         self._beat_ns, self._last_pause_ns, self._limit_ns = 0, 0, limit_ms * 1_000_000
 
     def _is_writable(self, role: Role, index: int, sub: int) -> bool:
-        found = find_variable(self._nodes[role].object_dictionary, index, sub)
-        return found is not None and found.writable
+        variable = find_variable(self._nodes[role].object_dictionary, index, sub)
+        return variable is not None and variable.writable
 
     def _find_heartbeat(self, role: Role) -> int:
         """Period of a node's heartbeat, ms: ours if it can be set, else that of the data sheet; 0: it has none."""
-        given = read_number(self._nodes[role].object_dictionary, 0x1017, 0) or 0
-        return HEARTBEAT if self._is_writable(role, 0x1017, 0) else given
+        period = read_number(self._nodes[role].object_dictionary, 0x1017, 0) or 0
+        return HEARTBEAT if self._is_writable(role, 0x1017, 0) else period
 
     def _write_values(self, role: Role) -> None:
         """Write the values of a DCF. Raises InputError for one that the device refuses."""
@@ -355,16 +356,16 @@ class Master:
         if node is None or node.mode is None or any(spec.has("mode") for spec in self._bench.frames.frames):
             return
         self._set(Role.CONTROLLER, MODE, 0, node.mode)
-        shown = None
+        mode = None
         for _ in range(20):
             data = self._upload(Role.CONTROLLER, MODE_DISPLAY, 0)
-            shown = node.mode if data is None else int.from_bytes(data[:1], "little", signed=True)
-            if shown == node.mode:
+            mode = node.mode if data is None else int.from_bytes(data[:1], "little", signed=True)
+            if mode == node.mode:
                 return
             self.wire.wait(lambda: False, 0.05)
         raise InputError(next(iter(self._bench.files), self._bench.name), "controller.mode",
                          f"a mode of {self._bench.describe_node(Role.CONTROLLER)}, not {node.mode}: "
-                         f"{name_object(MODE_DISPLAY, 0)} shows {shown}")
+                         f"{name_object(MODE_DISPLAY, 0)} shows {mode}")
 
     def configure_again(self) -> list[str]:
         """Write what `configure` wrote once more to the nodes that have booted since they were started.
@@ -374,22 +375,22 @@ class Master:
         """
         failures = []
         for role in sorted(self._booted):
-            written = [(index, sub, value) for (at, index, sub), value in self._settings.items() if at == role]
+            settings = [(index, sub, value) for (owner, index, sub), value in self._settings.items() if owner == role]
             try:
                 self._write_values(role)
-                for index, sub, value in written:
+                for index, sub, value in settings:
                     self._write(role, index, sub, value)
             except (RigError, ConfirmationError) as error:  # it would not answer the others either
                 failures.append(f"after its reset {error}")
         return failures
 
-    def restore(self, gone: Container[int] = ()) -> list[str]:
+    def restore(self, gone_nodes: Container[int] = ()) -> list[str]:
         """Set 0x1006 and 0x1016 back to what they were before `configure`, except in nodes that are gone.
 
         Otherwise a node that stays on the bus would go on watching a rig that has left. Returns the failures in words.
         """
         failures = []
-        for role, index, sub in (key for key in self._before if key[0] not in gone):
+        for role, index, sub in (key for key in self._before if key[0] not in gone_nodes):
             try:
                 self._nodes[role].sdo.download(index, sub, self._before[role, index, sub])
             except (SdoAbortedError, SdoCommunicationError, ConfirmationError) as error:
@@ -463,13 +464,13 @@ class Master:
     def read_parameters(self) -> dict[str, float]:
         """The parameters of the model that objects of the controller hold; those that it does not have are missing."""
         node = self._bench.nodes.get(Role.CONTROLLER)
-        found = {}
+        parameters = {}
         for index, sub, name in () if node is None else node.settings:
             try:
-                found[name] = float(self._find_entry(Role.CONTROLLER, index, sub).raw)
+                parameters[name] = float(self._find_entry(Role.CONTROLLER, index, sub).raw)
             except (SdoAbortedError, SdoCommunicationError):
                 break  # of a firmware without them
-        return found
+        return parameters
 
     def list_errors(self) -> list[Role]:
         """Nodes whose last EMCY has an error register."""
@@ -498,12 +499,12 @@ class Master:
 
     def _download(self, role: Role, index: int, sub: int, data: bytes, seconds: float) -> None:
         sdo = self._nodes[role].sdo
-        usual, sdo.RESPONSE_TIMEOUT = sdo.RESPONSE_TIMEOUT, seconds
+        timeout, sdo.RESPONSE_TIMEOUT = sdo.RESPONSE_TIMEOUT, seconds
         try:
             with self._name_failure(role, index, sub):
                 repeat_transfer(lambda: sdo.download(index, sub, data))
         finally:
-            sdo.RESPONSE_TIMEOUT = usual
+            sdo.RESPONSE_TIMEOUT = timeout
 
     @contextlib.contextmanager
     def _name_failure(self, role: Role, index: int, sub: int) -> Iterator[None]:

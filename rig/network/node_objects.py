@@ -90,12 +90,12 @@ class Identity:
         words = (f"{key.replace('_', ' ')} {_show_object(value)}" for key, value in self.known.items())
         return ", ".join(words) or "no identity objects"
 
-    def find_difference(self, found: Self) -> tuple[str, str]:
+    def find_difference(self, other: Self) -> tuple[str, str]:
         """The first key that another identity must have alike and has not, and how, in words; two empty texts for none.
         """
         for key, required in self.known.items():
-            if (said := getattr(found, key)) != required:
-                return key, f"{_show_object(required)}, but the controller has {_show_object(said)}"
+            if (answer := getattr(other, key)) != required:
+                return key, f"{_show_object(required)}, but the controller has {_show_object(answer)}"
         return "", ""
 
 
@@ -112,9 +112,9 @@ _TEXTS = ("name", "hardware", "software")
 
 def read_identity(upload: Callable[[int, int], bytes | None]) -> Identity:
     """The identity of a node; `upload(index, sub)` gives an object's bytes, None where the node has no such object."""
-    found = {key: upload(*place) for key, place in _OBJECTS.items()}
-    texts = {key: _decode_text(data) for key, data in found.items() if data is not None and key in _TEXTS}
-    numbers = {key: int.from_bytes(data[:4], "little") for key, data in found.items()
+    objects = {key: upload(*place) for key, place in _OBJECTS.items()}
+    texts = {key: _decode_text(data) for key, data in objects.items() if data is not None and key in _TEXTS}
+    numbers = {key: int.from_bytes(data[:4], "little") for key, data in objects.items()
                if data is not None and key not in _TEXTS}
     return Identity(**texts, **numbers)  # type: ignore[arg-type]  # the keys are the fields, with their types
 

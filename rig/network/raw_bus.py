@@ -211,12 +211,12 @@ def _note_errno(port: Port) -> None:
 
 def _wait_for_input(port: Port, deadline_ns: int) -> int:
     """FRAME when there is something to read, TIMEOUT or FAILED."""
-    left = deadline_ns - read_clock(port)
-    if left <= 0:
+    remaining_ns = deadline_ns - read_clock(port)
+    if remaining_ns <= 0:
         return TIMEOUT
     base = port.octets.ctypes.data
-    port.words[_TIME // 8] = left // 1_000_000_000
-    port.words[_TIME // 8 + 1] = left % 1_000_000_000
+    port.words[_TIME // 8] = remaining_ns // 1_000_000_000
+    port.words[_TIME // 8 + 1] = remaining_ns % 1_000_000_000
     count = _ppoll(base + _POLL, 1, base + _TIME, 0)
     if count < 0:
         _note_errno(port)
@@ -258,10 +258,10 @@ def _find_clock_distance(port: Port) -> int:
     for _ in range(5):
         before = read_clock(port)
         wall = _read_wall_clock(port)
-        taken = read_clock(port) - before
-        if taken < shortest:
-            distance, shortest = wall - before - taken // 2, taken
-        if taken < 5_000:
+        duration = read_clock(port) - before
+        if duration < shortest:
+            distance, shortest = wall - before - duration // 2, duration
+        if duration < 5_000:
             break
     return distance
 
@@ -427,8 +427,8 @@ def decode_datagram(port: Port, size: int) -> tuple[int, int, int]:
             flags |= 1 << key
         place += count
     is_valid = place == end and 0 <= cob_id <= (IDENTIFIER if flags & _EXTENDED else 0x7FF) and length >= 0
-    refused = _IS_ERROR | _REMOTE if flags & _FD else _IS_ERROR | _REMOTE | _SWITCH | _PASSIVE
-    if not is_valid or flags & refused:
+    refused_flags = _IS_ERROR | _REMOTE if flags & _FD else _IS_ERROR | _REMOTE | _SWITCH | _PASSIVE
+    if not is_valid or flags & refused_flags:
         return -1, 0, 0
     if flags & _EXTENDED:
         cob_id |= EXTENDED
@@ -575,14 +575,14 @@ class RawBus(contextlib.AbstractContextManager["RawBus"]):
 
     def _allow(self, cob_ids: Sequence[int]) -> None:
         """One bit a COB-ID, for the frames that the kernel lets through; those beyond 11 bits are a list."""
-        listed = [cob_id & ~SWITCHED for cob_id in cob_ids if cob_id > 0x7FF]
-        if len(listed) > _LIST_SIZE // 8:
-            raise RigError(f"{self.spec}: {len(listed)} frames to receive; at most {_LIST_SIZE // 8} are possible")
-        allowed = np.zeros(0x800, np.uint8)
-        allowed[[cob_id for cob_id in cob_ids if cob_id <= 0x7FF]] = 1
-        self.port.octets[_ALLOWED: _ALLOWED + 256] = np.packbits(allowed, bitorder="little")
-        self.port.words[_LIST // 8: _LIST // 8 + len(listed)] = listed
-        self.port.words[_LISTED] = len(listed)
+        wide_ids = [cob_id & ~SWITCHED for cob_id in cob_ids if cob_id > 0x7FF]
+        if len(wide_ids) > _LIST_SIZE // 8:
+            raise RigError(f"{self.spec}: {len(wide_ids)} frames to receive; at most {_LIST_SIZE // 8} are possible")
+        bits = np.zeros(0x800, np.uint8)
+        bits[[cob_id for cob_id in cob_ids if cob_id <= 0x7FF]] = 1
+        self.port.octets[_ALLOWED: _ALLOWED + 256] = np.packbits(bits, bitorder="little")
+        self.port.words[_LIST // 8: _LIST // 8 + len(wide_ids)] = wide_ids
+        self.port.words[_LISTED] = len(wide_ids)
 
 
 def _open_socketcan(channel: str, is_fd: bool, stack: contextlib.ExitStack) -> socket.socket:

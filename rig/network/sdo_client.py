@@ -40,10 +40,10 @@ def require_confirmation(request: bytes, response: bytes) -> None:
     Traceback (most recent call last):
     rig.network.sdo_client.SdoProblem: confirmation of object 0x1001 sub 0
     """
-    asked, said, is_abort = request[0] >> 5, response[0] >> 5, response[0] == ABORT
-    is_initiate, expected = asked in (_DOWNLOAD, _UPLOAD), _CONFIRMATION[asked]
-    if not is_abort and said != expected:
-        raise SdoProblem(f"command specifier {said} (0x{response[0]:02X}), expected {expected}", _COMMAND_INVALID)
+    command, answer, is_abort = request[0] >> 5, response[0] >> 5, response[0] == ABORT
+    is_initiate, confirmation = command in (_DOWNLOAD, _UPLOAD), _CONFIRMATION[command]
+    if not is_abort and answer != confirmation:
+        raise SdoProblem(f"command specifier {answer} (0x{response[0]:02X}), expected {confirmation}", _COMMAND_INVALID)
     if is_initiate and response[1:4] != request[1:4]:
         _, index, sub = HEAD.unpack_from(response)
         raise SdoProblem(f"{'abort' if is_abort else 'confirmation'} of object 0x{index:04X} sub {sub}",
@@ -130,10 +130,10 @@ class CheckedSdoClient(SdoClient):
             data, is_sized = upload_object(self.request_response, index, subindex, self.largest_upload)
             variable = self.od.get_variable(index, subindex)
             if variable is not None and variable.fixed_size:
-                expected = len(variable) // 8
-                data = data if is_sized else data[:expected]
-                if len(data) != expected:
-                    raise SdoProblem(f"{count_nouns(len(data), 'byte')}, expected {expected}")
+                size = len(variable) // 8
+                data = data if is_sized else data[:size]
+                if len(data) != size:
+                    raise SdoProblem(f"{count_nouns(len(data), 'byte')}, expected {size}")
         return data
 
     def download(self, index: int, subindex: int, data: bytes, force_segment: bool = False) -> None:

@@ -63,7 +63,7 @@ def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], le
     accept, drop = 0xFFFFFFFF, 0
     program = [(load_half, 0, 0, 0), (equal, 0, 1, own_port), (give, 0, 0, drop)]
     if len(cob_ids) <= 64:
-        listed, others = (drop, accept) if left_out else (accept, drop)
+        list_action, other_action = (drop, accept) if left_out else (accept, drop)
         # The identifier stands here itself, or 0xCC, 0xCD or 0xCE and 1, 2 or 4 bytes; behind it "is_extended_id" and
         # a truth value, whose last bit goes where the COB-ID has it.
         branches = [(give, 0, 0, accept)]
@@ -71,10 +71,10 @@ def attach_filter(rx: socket.socket, own_port: int, cob_ids: Collection[int], le
                                       (0x80, load_byte, 0, 16)):
             body = [(load_byte, 0, 0, 8 + 35 + flag), (keep_bits, 0, 0, 1), (shift_left, 0, 0, 31), (copy, 0, 0, 0),
                     (load, 0, 0, 8 + 35 + at), (add_copy, 0, 0, 0), (always, 0, 0, len(branches))]
-            taken = (equal, 0, len(body), first) if at else (at_least, len(body), 0, first)
-            branches = [(load_byte, 0, 0, 8 + 35), taken, *body, *branches]
+            condition = (equal, 0, len(body), first) if at else (at_least, len(body), 0, first)
+            branches = [(load_byte, 0, 0, 8 + 35), condition, *body, *branches]
         program += [*branches, *(step for cob_id in cob_ids for step in (
-            (equal, 0, 1, cob_id & ~FD), (give, 0, 0, listed))), (give, 0, 0, others)]
+            (equal, 0, 1, cob_id & ~FD), (give, 0, 0, list_action))), (give, 0, 0, other_action)]
     else:
         program.append((give, 0, 0, accept))
     steps = bytearray(b"".join(struct.pack("=HBBI", *step) for step in program))
