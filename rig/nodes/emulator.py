@@ -40,12 +40,12 @@ def find_plant_node(bench: Bench) -> CanopenNode:
     require(PLANT in bench.nodes, bench.name, "plant_node",
             "a table with the plant as a node; the rig itself moves the plant of this bench")
     node, roles = bench.nodes[PLANT], [role for each in bench.frames.frames for role in each.roles]
-    needed = ((("feedback", "valve_state", "drive"), roles),
-              ((*(s.word for s in bench.signals.outputs), "flags", "cycle"), node.outputs),
-              ((bench.signals.drive.word, "cycle"), node.inputs))
-    lacking = [word for words, known in needed for word in words if word not in known]
-    require(not lacking, bench.name, "plant_node", "frames of feedback and valve state, which carry all outputs of the "
-                                                   f"plant, flags and cycle, not one without {', '.join(lacking)}")
+    requirements = ((("feedback", "valve_state", "drive"), roles),
+                    ((*(s.word for s in bench.signals.outputs), "flags", "cycle"), node.outputs),
+                    ((bench.signals.drive.word, "cycle"), node.inputs))
+    missing = [word for words, names in requirements for word in words if word not in names]
+    require(not missing, bench.name, "plant_node", "frames of feedback and valve state, which carry all outputs of the "
+                                                   f"plant, flags and cycle, not one without {', '.join(missing)}")
     return node
 
 
@@ -66,9 +66,9 @@ class PlantNode:
         self.device.on_write, self.device.on_nmt = self._on_write, self._on_nmt
         self._od = self.device.od.values
         self._frames = [self._bench.frames.find_role(role) for role in ("drive", "feedback", "valve_state")]
-        received, sent = self.device.pdo.rpdos.values(), self.device.pdo.tpdos.values()
-        self._drive = next(pdo for pdo in received if pdo.cob_id == self._frames[0].identifier)
-        self._tpdos = [next(pdo for pdo in sent if pdo.cob_id == spec.identifier) for spec in self._frames[1:]]
+        rpdos, tpdos = self.device.pdo.rpdos.values(), self.device.pdo.tpdos.values()
+        self._drive = next(pdo for pdo in rpdos if pdo.cob_id == self._frames[0].identifier)
+        self._tpdos = [next(pdo for pdo in tpdos if pdo.cob_id == spec.identifier) for spec in self._frames[1:]]
         self._obeying = False  # an NMT command, which the cycle obeys by itself
         self._booking = False  # an error whose EMCY the cycle has sent
         self._diverged = ""
@@ -86,10 +86,11 @@ class PlantNode:
                 previous one stays.
         """
         scenario = scenario or Scenario(load_model(self._bench.plant), Plan(stop=0))
-        own, named = ([(s.word, s.unit) for s in (*signals.outputs, signals.drive)]
-                      for signals in (scenario.model.kind.signals, self._bench.signals))
-        require(own == named, "--model", scenario.model.name, "a plant with the signals of the bench: "
-                f"{', '.join(f'{word} ({unit})' for word, unit in named)}")
+        plant_signals, bench_signals = ([(s.word, s.unit) for s in (*signals.outputs, signals.drive)]
+                                        for signals in (scenario.model.kind.signals, self._bench.signals))
+        require(plant_signals == bench_signals, "--model", scenario.model.name,
+                "a plant with the signals of the bench: "
+                f"{', '.join(f'{word} ({unit})' for word, unit in bench_signals)}")
         self._begin(scenario)
 
     def _on_write(self, index: int, sub: int, data: bytes) -> None:
@@ -111,8 +112,8 @@ class PlantNode:
         """Make new memory for the cycle; the SYNC to come is that of cycle 0. The node stays in its NMT state."""
         plant = load_plant(scenario)
         memory = ec.make_memory(scenario, *plant.code, self._frames)
-        words, answered = memory.words, self._node.inputs["cycle"].field
-        words[ec.NODE: ec.MISSED_LIMIT + 1] = (self._node.node, self._drive.n, answered.wrap_number(-1),
+        words, cycle_field = memory.words, self._node.inputs["cycle"].field
+        words[ec.NODE: ec.MISSED_LIMIT + 1] = (self._node.node, self._drive.n, cycle_field.wrap_number(-1),
                                                self._bench.most_missed)
         with self._pause():
             if self._scenario:
@@ -173,21 +174,21 @@ class PlantNode:
 
     def _share_settings(self) -> None:
         """What SDO may change, and the error register without the cycle's own error."""
-        shared, od = self._memory.words, self.device.od
-        shared[ec.PERIOD] = od.read_number(0x1006, 0)
+        words, od = self._memory.words, self.device.od
+        words[ec.PERIOD] = od.read_number(0x1006, 0)
         emcy = od.read_number(0x1014, 0, 1 << 31)
-        shared[ec.EMCY_ID] = -1 if emcy >> 31 else emcy & 0x7FF
-        others = [code for code in self.device.emcy.active if code != EmcyCode.RPDO_TIMEOUT]
-        communication = any(code != EmcyCode.SOFTWARE for code in others)
-        shared[ec.OTHER_REGISTER] = ErrorRegister.GENERIC * bool(others) | ErrorRegister.COMMUNICATION * communication
+        words[ec.EMCY_ID] = -1 if emcy >> 31 else emcy & 0x7FF
+        errors = [code for code in self.device.emcy.active if code != EmcyCode.RPDO_TIMEOUT]
+        communication = any(code != EmcyCode.SOFTWARE for code in errors)
+        words[ec.OTHER_REGISTER] = ErrorRegister.GENERIC * bool(errors) | ErrorRegister.COMMUNICATION * communication
         for row, tpdo in enumerate(self._tpdos):
             at, kind = ec.TPDOS_AT + 4 * row, od.read_number(TPDO + tpdo.n - 1, 2)
-            shared[at + ec.ID] = -1 if tpdo.cob_id is None else tpdo.cob_id
-            if shared[at + ec.TYPE] != kind:
-                shared[at + ec.TYPE] = shared[at + ec.COUNT] = kind
-        shared[ec.DRIVE_TYPE] = od.read_number(RPDO + self._drive.n - 1, 2)
-        shared[ec.SYNC_ID] = od.read_number(0x1005, 0, 0x80) & 0x7FF
-        shared[ec.DRIVE_ID] = -1 if self._drive.cob_id is None else self._drive.cob_id
+            words[at + ec.ID] = -1 if tpdo.cob_id is None else tpdo.cob_id
+            if words[at + ec.TYPE] != kind:
+                words[at + ec.TYPE] = words[at + ec.COUNT] = kind
+        words[ec.DRIVE_TYPE] = od.read_number(RPDO + self._drive.n - 1, 2)
+        words[ec.SYNC_ID] = od.read_number(0x1005, 0, 0x80) & 0x7FF
+        words[ec.DRIVE_ID] = -1 if self._drive.cob_id is None else self._drive.cob_id
 
     def _book_events(self) -> None:
         """Take over what the cycle noticed or did: errors, whose EMCY it sends itself or leaves to the services."""
@@ -213,13 +214,13 @@ class PlantNode:
 
     def _show_values(self, request: bytes) -> None:
         """Put the values of the cycle into the dictionary, which an SDO request is about to read."""
-        shared, frames, signals = self._memory.words, self._memory.frames, ec.list_channels(self._bench.signals)
+        words, frames, signals = self._memory.words, self._memory.frames, ec.list_channels(self._bench.signals)
         values = dict(zip(signals, frames.doubles[frames.words[VALUES_AT]:], strict=False))
         for places, cycle in ((self._node.outputs, ec.FRAME_CYCLE), (self._node.inputs, ec.ANSWERED)):
             for signal, (key, field) in places.items():
-                self._od[key] = (field.wrap_number(int(shared[cycle])) if signal == "cycle" else
+                self._od[key] = (field.wrap_number(int(words[cycle])) if signal == "cycle" else
                                  field.compute_counts(values.get(signal, 0.0)))
-        self._od[COUNTERS, 1], self._od[COUNTERS, 2] = int(shared[ec.MISSING]), int(shared[ec.LATE])
+        self._od[COUNTERS, 1], self._od[COUNTERS, 2] = int(words[ec.MISSING]), int(words[ec.LATE])
 
 
 class Emulator(PlantNode):

@@ -144,11 +144,11 @@ def run_emulator(port: Port, m: Memory) -> None:
 def serve_frame(port: Port, m: Memory) -> None:
     """Deal with the frame that Python has pushed, or with LOST_SYNCS, or deliver the late frames that are due."""
     words = m.words
-    pushed = words[PUSHED]
+    kind = words[PUSHED]
     words[PUSHED] = 0
-    if pushed == LOST_SYNCS:
+    if kind == LOST_SYNCS:
         _pass_lost_syncs(port, m)
-    elif pushed:
+    elif kind:
         _take_frame(port, m, words[PUSHED_TIME], words[PUSHED_ID], words[PUSHED_LENGTH], words[PUSHED_DATA])
     else:
         _release_until(port, m, read_clock(port), True)
@@ -391,16 +391,16 @@ def _miss(port: Port, m: Memory, counter: int) -> int:
     return CURRENT_ZEROED
 
 
-def _announce_timeout(port: Port, m: Memory, raised: int) -> None:
+def _announce_timeout(port: Port, m: Memory, is_raised: int) -> None:
     """EMCY 0x8250 or its end. It stands on the bus before the feedback of this cycle, so the loop itself sends it."""
     words = m.words
-    if words[ZEROED] == raised:
+    if words[ZEROED] == is_raised:
         return
-    words[ZEROED] = raised
-    _post_event(m, TIMEOUT_RAISED if raised else TIMEOUT_CLEARED)
+    words[ZEROED] = is_raised
+    _post_event(m, TIMEOUT_RAISED if is_raised else TIMEOUT_CLEARED)
     register = words[OTHER_REGISTER]
     data = register << 16
-    if raised:
+    if is_raised:
         data = _TIMEOUT_CODE | (register | _TIMEOUT_REGISTER) << 16 | words[DRIVE_NUMBER] << 24
     if words[EMCY_ID] >= 0 and not _is_bus_off(m, words[CYCLE] - 1):
         _send(port, m, words[EMCY_ID], 8, data)
@@ -666,17 +666,17 @@ def _disturb(m: Memory, signal: int, value: float, k: int) -> float:
 
 def fill_noise(m: Memory, rng: np.random.Generator, least: int = 1024) -> None:
     """Fill the ring of noise with the numbers that `plant.Actuator` draws, once `least` rows of it are free."""
-    filled = int(m.words[NOISE_FILLED])
-    free = int(m.words[PLANT_CYCLE]) + NOISE_RING - filled
+    end = int(m.words[NOISE_FILLED])
+    free = int(m.words[PLANT_CYCLE]) + NOISE_RING - end
     if free < least:
         return
     numbers = int(m.words[NOISES])
     rows = rng.standard_normal((free, numbers))
-    first = min(free, NOISE_RING - filled % NOISE_RING)  # up to the ring's end, then from its start
-    start = filled % NOISE_RING
+    first = min(free, NOISE_RING - end % NOISE_RING)  # up to the ring's end, then from its start
+    start = end % NOISE_RING
     noise = m.reals[NOISE_AT: NOISE_AT + numbers * NOISE_RING].reshape(-1, numbers)
     noise[start: start + first], noise[: free - first] = rows[:first], rows[first:]
-    m.words[NOISE_FILLED] = filled + free
+    m.words[NOISE_FILLED] = end + free
 
 
 def make_memory(scenario: Scenario, advance: int = 0, read: int = 0, frames: Sequence[FrameSpec] = ()) -> Memory:
@@ -693,10 +693,10 @@ def make_memory(scenario: Scenario, advance: int = 0, read: int = 0, frames: Seq
     values: list[float] = []
     for name, changes in schedule.parameters.items():
         first = min(begin for begin, _ in changes)
-        last = max(begin + len(changed) for begin, changed in changes)
+        last = max(begin + len(piece) for begin, piece in changes)
         course = np.full(last - first + 1, model[name])
-        for begin, changed in reversed(changes):  # of several in a cycle the first counts
-            course[begin - first: begin - first + len(changed)] = changed
+        for begin, piece in reversed(changes):  # of several in a cycle the first counts
+            course[begin - first: begin - first + len(piece)] = piece
         parameters.append((names.index(name), first, len(course), len(values)))
         values += course.tolist()
     for number, output in enumerate(model.kind.signals.outputs):

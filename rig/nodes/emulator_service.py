@@ -50,8 +50,8 @@ class EmulatorService(PlantNode):
             RigError: the loop's bus is gone.
         """
         self._book_events()
-        if (recorded := int(self._memory.words[ec.RECORDED])) != self._noticed:
-            self._noticed = recorded
+        if (cycles := int(self._memory.words[ec.RECORDED])) != self._noticed:
+            self._noticed = cycles
             self.device.sync.notice(t_ns)
         self.device.tick(t_ns)
         ec.fill_noise(self._memory, self._noise)
@@ -97,19 +97,19 @@ class EmulatorService(PlantNode):
         self._obey(int(words[ec.RESET_COMMAND]))
 
     def _share_settings(self) -> None:
-        shared = self._memory.words
-        heard = int(shared[ec.SYNC_ID]), int(shared[ec.DRIVE_ID])
+        words = self._memory.words
+        old_ids = int(words[ec.SYNC_ID]), int(words[ec.DRIVE_ID])
         super()._share_settings()
-        self._bus.use_kernel_times(bool(shared[ec.PERIOD]))
-        wanted = int(shared[ec.SYNC_ID]), int(shared[ec.DRIVE_ID])
-        if heard != wanted:
-            self._bus.set_filter([0, *(cob_id for cob_id in wanted if cob_id >= 0)])
+        self._bus.use_kernel_times(bool(words[ec.PERIOD]))
+        new_ids = int(words[ec.SYNC_ID]), int(words[ec.DRIVE_ID])
+        if old_ids != new_ids:
+            self._bus.set_filter([0, *(cob_id for cob_id in new_ids if cob_id >= 0)])
 
     def _show_values(self, request: bytes) -> None:
         super()._show_values(request)
-        shared = self._memory.words
-        longest = (shared[word] // 1000 for word in (ec.LONGEST_WAKE, ec.LONGEST_RESPONSE, ec.LONGEST_CYCLE))
-        counts = shared[ec.RECORDED], shared[ec.UNSENT], self._bus.overflows, *longest, self._kind
+        words = self._memory.words
+        longest = (words[word] // 1000 for word in (ec.LONGEST_WAKE, ec.LONGEST_RESPONSE, ec.LONGEST_CYCLE))
+        counts = words[ec.RECORDED], words[ec.UNSENT], self._bus.overflows, *longest, self._kind
         for sub, value in enumerate(counts, 3):
             self._od[COUNTERS, sub] = min(int(value), 0xFFFFFFFF)
         if len(request) == 8 and request[0] >> 5 == 2 and int.from_bytes(request[1:3], "little") == CYCLE_RECORD:
@@ -117,9 +117,9 @@ class EmulatorService(PlantNode):
 
     def read_record(self) -> CycleRecord:
         """The record of the cycles so far, at most the last RING."""
-        recorded = int(self._memory.words[ec.RECORDED])
+        cycles = int(self._memory.words[ec.RECORDED])
         times = self._memory.words[ec.TIMES_AT: ec.TIMES_AT + 6 * RING].reshape(-1, 6)
-        return CycleRecord(*times[np.arange(max(0, recorded - RING), recorded) % RING].T)
+        return CycleRecord(*times[np.arange(max(0, cycles - RING), cycles) % RING].T)
 
 
 @cache

@@ -27,8 +27,8 @@ class Firmware:
 
     def __init__(self, send: Send, gains: Gains | None = None, model: Model | None = None) -> None:
         self._taken = Demand(model or Model())
-        own = load_bench().nodes[CONTROLLER]
-        self.device = Device(own.node, own.eds, send)
+        node = load_bench().nodes[CONTROLLER]
+        self.device = Device(node.node, node.eds, send)
         self.device.on_sync = self._on_sync
         self.device.on_rpdo = self._on_rpdo
         self.device.on_nmt = self._on_nmt
@@ -36,10 +36,10 @@ class Firmware:
         self.device.on_sync_lost = self._on_sync_lost
         self.device.on_write = self._on_write
         self._od = self.device.od.values
-        self._demand, self._position = own.inputs["position_demand"], own.inputs["ram_position"]
-        self._current = own.outputs["current"]
-        self._control, self._status_word = own.inputs["control_word"].key, own.outputs["status_word"].key
-        self._cycle, self._answered = own.inputs["cycle"].key, own.outputs["cycle"].key
+        self._demand, self._position = node.inputs["position_demand"], node.inputs["ram_position"]
+        self._current = node.outputs["current"]
+        self._control, self._status_word = node.inputs["control_word"].key, node.outputs["status_word"].key
+        self._cycle, self._answered = node.inputs["cycle"].key, node.outputs["cycle"].key
         self._od.update({(GAINS, sub): value for sub, value in enumerate(gains or (), 1)})
         self._lost: set[int] = set()  # RPDOs whose loss was announced by EMCY; a restart does not take that back
         self._restart()
@@ -128,14 +128,14 @@ class Firmware:
     def _status(self) -> int:
         """Status word: the level bits of the control word, unless a fault is latched."""
         control = cast(int, self._od[self._control])
-        reset = bool(control & _RESET)
-        if self._fault and reset and not self._acknowledged and not self.device.emcy.active:
+        is_reset = bool(control & _RESET)
+        if self._fault and is_reset and not self._acknowledged and not self.device.emcy.active:
             self._fault = False
-        self._acknowledged = reset
+        self._acknowledged = is_reset
         if self._fault:
             return 0
-        asked = control & _ACTIVE  # the levels build on each other: 1, 3, 7
-        return (asked if asked & (asked + 1) == 0 else 0) | _READY
+        levels = control & _ACTIVE  # the levels build on each other: 1, 3, 7
+        return (levels if levels & (levels + 1) == 0 else 0) | _READY
 
     def _drive(self, current: float, status: int) -> None:
         od = self._od

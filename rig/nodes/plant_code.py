@@ -39,14 +39,14 @@ class CompiledPlant:
         """
         with report_law_errors(model):
             flat, record = model.build_flat_state(), model.build_record()
-            stored = load_stored_advance(model.effects, model.plant)
-            stored.warm(lambda: (flat.copy(), 5e-3, 100.0, 0.0, 0.0, record, 10))
+            advance = load_stored_advance(model.effects, model.plant)
+            advance.warm(lambda: (flat.copy(), 5e-3, 100.0, 0.0, 0.0, record, 10))
             read = 0
             if not find_direct_readings(model):
                 run = build_kernel(read_flat_sensors, model.effects, plant=model.plant)
                 run(flat, np.zeros(len(model.kind.signals.outputs) + 1), 0.0, record)
                 read = find_function_address(run)
-        self.code = stored.find_address(), read
+        self.code = advance.find_address(), read
 
 
 class PlantProgram:

@@ -33,8 +33,8 @@ class Scenario(NamedTuple):
         require_sensible(plan, model)
         counts = [0] * plan.start + np.rint(load / find_load_count(model)).astype(int).tolist()
         # the plant must have the effects whose parameters faults change from the start
-        changed = {fault.parameter.partition(".")[0] for fault in plan.faults if isinstance(fault, Parameter)}
-        return cls(model.with_effects(changed), plan, tuple(counts), seed)
+        effects = {fault.parameter.partition(".")[0] for fault in plan.faults if isinstance(fault, Parameter)}
+        return cls(model.with_effects(effects), plan, tuple(counts), seed)
 
     def load(self) -> list[float]:
         """The load, SI, one a cycle; none after the last."""
@@ -71,15 +71,15 @@ class Scenario(NamedTuple):
         try:
             largest = 1 << 26  # bytes of JSON: six hours of random load
             table: dict[str, Any] = json.loads(zlib.decompressobj().decompress(data, largest))
-            named = table["model"]
-            bare = build_bare_model(find_key(str(named.get("plant", "eha"))), str(named["name"]))
-            model = bare.with_effects(named["effects"]).replace(named["values"], WHERE)
-            force = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
-            plan, seed = Plan.from_json(table["plan"], bare.plant), int(table["seed"])
+            model_table = table["model"]
+            bare_model = build_bare_model(find_key(str(model_table.get("plant", "eha"))), str(model_table["name"]))
+            model = bare_model.with_effects(model_table["effects"]).replace(model_table["values"], WHERE)
+            load_counts = np.cumsum(np.cumsum(np.array(table["load"], np.int64))).tolist()
+            plan, seed = Plan.from_json(table["plan"], bare_model.plant), int(table["seed"])
             require(min(seed, plan.seed) >= 0 and 0 <= plan.start <= plan.stop <= LONGEST_PLAN, WHERE, "plan",
                     f"seeds from 0, and at most {LONGEST_PLAN} cycles")
             require_sensible(plan, model)
-            return cls(model, plan, tuple(force), seed)
+            return cls(model, plan, tuple(load_counts), seed)
         except InputError:
             raise
         except Exception as error:  # anybody may send anything
