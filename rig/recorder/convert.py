@@ -88,14 +88,14 @@ def import_own_table(source: Path, out: Path) -> int | None:
         InputError: a file that cannot be read.
     """
     measurement = open_measurement(source)
-    found = find_own_table(lambda _: measurement.units)
-    if found is None:
+    own_table = find_own_table(lambda _: measurement.units)
+    if own_table is None:
         return None
-    plant, table = found
+    plant, table = own_table
     channels = measurement.read(sorted(table.sources), ())
     columns = combine_columns({name: channel.values for name, channel in channels.items()}, table)
-    unused = sorted(set(measurement.units) - table.sources)
-    notes = (f"columns that are not used: {', '.join(unused)}",) if unused else ()
+    unused_names = sorted(set(measurement.units) - table.sources)
+    notes = (f"columns that are not used: {', '.join(unused_names)}",) if unused_names else ()
     return _write_own(make_table_trace(source, columns, plant.signals, notes, plant.name), source, out)
 
 
@@ -106,9 +106,9 @@ def _write_own(trace: Trace, source: Path, out: Path) -> int:
     return len(trace)
 
 
-def write_imported(trace: Trace, chosen: ImportMap, out: Path) -> None:
+def write_imported(trace: Trace, import_map: ImportMap, out: Path) -> None:
     """Write an imported trace as a log, with its map as an attachment and where it comes from as metadata."""
-    attached = replace(trace, attachments={"map.toml": chosen.text.encode()})
+    attached = replace(trace, attachments={"map.toml": import_map.text.encode()})
     write_mcap(attached, out, collect_provenance(period=repr(trace.period), pace="imported", **trace.provenance))
 
 
@@ -118,9 +118,9 @@ def write_mcap(trace: Trace, out: Path, metadata: Mapping[str, str] | None = Non
     Raises:
         RecorderError: a place that cannot be written.
     """
-    given = {"period": repr(trace.period), **trace.provenance} if metadata is None else metadata
+    provenance = {"period": repr(trace.period), **trace.provenance} if metadata is None else metadata
     attachments = {name: ("application/octet-stream", data) for name, data in trace.attachments.items()}
-    _write_log(out, attachments, {**given, **write_sensors(trace.sensors)}, _list_rows(trace),
+    _write_log(out, attachments, {**provenance, **write_sensors(trace.sensors)}, _list_rows(trace),
                trace.declared)
 
 
@@ -128,19 +128,19 @@ def _list_rows(trace: Trace, block: int = 10_000) -> Iterator[tuple[int, Signals
     """The rows of a trace that have a value, made in blocks: those of a long recording would fill the memory."""
     signals = np.column_stack([trace.columns[name] for name in trace.declared.names])
     make: Callable[..., Signals] = make_row_record(trace.declared)
-    known = np.flatnonzero(~np.isnan(signals).all(axis=1))
-    for first in range(0, len(known), block):
-        rows = known[first:first + block]
-        for k, phase, values in zip(rows.tolist(), trace.phase[rows].tolist(), signals[rows].tolist(), strict=True):
+    rows = np.flatnonzero(~np.isnan(signals).all(axis=1))
+    for first in range(0, len(rows), block):
+        part = rows[first:first + block]
+        for k, phase, values in zip(part.tolist(), trace.phase[part].tolist(), signals[part].tolist(), strict=True):
             yield round(k * trace.period * 1e9), make(k, phase, *values, 0, 0, 0)
 
 
 def _write_log(out: Path, attachments: Mapping[str, tuple[str, bytes]], metadata: Mapping[str, str],
                items: Iterable[Frame | tuple[int, Record]],
-               declared: plant_signals.Signals = plant_signals.EHA) -> None:
+               signals: plant_signals.Signals = plant_signals.EHA) -> None:
     """Write raw frames, and records with their times, as fast as the writer can: here nothing paces the loop."""
     with write_whole(out) as part:
-        recorder = Recorder(part, attachments, metadata, declared=declared)
+        recorder = Recorder(part, attachments, metadata, declared=signals)
         for k, item in enumerate(items):
             if isinstance(item, Frame):
                 recorder.frame(item)
@@ -171,10 +171,10 @@ def import_frames(source: Path, out: Path, bench: Bench) -> int:
     spans = np.sort(np.diff(starts))
     middle = float(spans[len(spans) // 2]) if len(spans) else bench.cycle_ns
     first, stop = max(pairwise([0, *cycles.plant_starts, len(starts)]), key=lambda piece: piece[1] - piece[0])
-    told = PROFILES[bench.profile].ladder[State.ACTIVE]
-    active = [k for k in range(first, stop) if cycles.rows[k][1].control == told]
-    if active:
-        first, stop = active[0], active[-1] + 1
+    active_word = PROFILES[bench.profile].ladder[State.ACTIVE]
+    active_rows = [k for k in range(first, stop) if cycles.rows[k][1].control == active_word]
+    if active_rows:
+        first, stop = active_rows[0], active_rows[-1] + 1
     for k, (_, row) in enumerate(cycles.rows):
         row.phase = int(k >= first) + int(k >= stop)
     period = bench.cycle_ns / 1e9
@@ -233,21 +233,21 @@ class _CycleBuilder:
         return []
 
     def _open(self, t_ns: int) -> None:
-        cycle, expected = (self.rows[-1][1].cycle + 1, self._recent[-1][0] + 1) if self.rows else (0, 0)
-        sent = expected if self._sent is None else self._sent
-        skipped = (sent - expected) & 0xFFFF if self.rows else 0
-        cycle += skipped if skipped < 1000 else 0  # the counter of a bench started anew is no gap
+        cycle, next_number = (self.rows[-1][1].cycle + 1, self._recent[-1][0] + 1) if self.rows else (0, 0)
+        number = next_number if self._sent is None else self._sent
+        gap = (number - next_number) & 0xFFFF if self.rows else 0
+        cycle += gap if gap < 1000 else 0  # the counter of a bench started anew is no gap
         row = self._record(cycle, 1, *(np.nan for _ in range(len(self._columns) - len(_WORDS))), 0, 0, 0)
         self._fill(row, self._waiting)
         self.rows.append((t_ns, row))
-        self._recent.append((sent & 0xFFFF, row))
+        self._recent.append((number & 0xFFFF, row))
         self._waiting = {name: value for name, value in self._waiting.items() if name in self._lasting}
         self._sent = None
 
     def _take(self, t_ns: int, spec: FrameSpec, values: Mapping[str, float]) -> None:
         if spec.sender is Role.CONTROLLER:
-            for sent, row in list(self._recent)[-1 if "cycle" not in values else 0:]:
-                if sent == values.get("cycle", sent):
+            for number, row in list(self._recent)[-1 if "cycle" not in values else 0:]:
+                if number == values.get("cycle", number):
                     self._fill(row, values)
         elif spec.is_before_sync or (self._frames.sync is None and spec is self.begin):
             self._waiting |= values
@@ -298,14 +298,14 @@ def _read_signals(path: Path, messages: Mapping[tuple[int, bool], Any], names: C
     Raises:
         InputError: a log that cannot be read, or without a frame of one of the signals.
     """
-    wanted = {name.rpartition(".")[0] for name in names}
+    message_names = {name.rpartition(".")[0] for name in names}
     columns = {name: (array("d"), array("d")) for name in names}  # values, times
     for t, frame in list_can_messages(path):
-        known = messages.get((frame.arbitration_id, frame.is_extended_id))
-        if known is None or known.name not in wanted or len(frame.data) < known.length:
+        message = messages.get((frame.arbitration_id, frame.is_extended_id))
+        if message is None or message.name not in message_names or len(frame.data) < message.length:
             continue
-        for signal, value in known.decode(bytes(frame.data), decode_choices=False).items():
-            name = f"{known.name}.{signal}"
+        for signal, value in message.decode(bytes(frame.data), decode_choices=False).items():
+            name = f"{message.name}.{signal}"
             if name in columns:
                 columns[name][0].append(float(value))
                 columns[name][1].append(t)

@@ -35,12 +35,12 @@ class Salvage:
     reason: str  # why reading stopped; empty for a whole log
 
     def __str__(self) -> str:
-        kept = (f"{count_nouns(self.messages, 'message')}, {count_nouns(self.cycles, 'cycle')}, {self.duration:.3f} s, "
-                f"{count_nouns(len(self.attachments), 'file')}")
+        content = (f"{count_nouns(self.messages, 'message')}, {count_nouns(self.cycles, 'cycle')}, "
+                   f"{self.duration:.3f} s, {count_nouns(len(self.attachments), 'file')}")
         if self.complete:
-            return f"{self.path}: the log was complete: {kept}"
-        return (f"{self.path}: kept {kept}; lost {self.lost_bytes} bytes without an intact chunk ({self.reason}) and "
-                f"data not yet written, at most about 0.25 s")
+            return f"{self.path}: the log was complete: {content}"
+        return (f"{self.path}: kept {content}; lost {self.lost_bytes} bytes without an intact chunk ({self.reason}) "
+                f"and data not yet written, at most about 0.25 s")
 
 
 def recover_log(path: Path, out: Path) -> Salvage:
@@ -74,15 +74,15 @@ def _list_intact_records(file: BoundedFile, damage: _Damage) -> Iterator[McapRec
 
     A chunk is given as the records in it, unpacked.
     """
-    at, left = 0, limit_unpacked_size(file.size)
+    at, remaining_bytes = 0, limit_unpacked_size(file.size)
     try:
         for record in StreamReader(cast(IO[bytes], file), emit_chunks=True, record_size_limit=file.size).records:
             start, at = at, file.tell()
             if not isinstance(record, Chunk):
                 yield record
                 continue
-            left -= record.uncompressed_size
-            if left < 0:
+            remaining_bytes -= record.uncompressed_size
+            if remaining_bytes < 0:
                 raise UnpackingError("the chunks declare too many bytes for a file of this size")
             try:
                 raw = unpack_chunk(record)

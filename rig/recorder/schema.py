@@ -100,27 +100,27 @@ class NmtState:
 
 
 @cache
-def make_row_record(declared: plant_signals.Signals) -> type[Signals]:
+def make_row_record(signals: plant_signals.Signals) -> type[Signals]:
     """The record of one cycle of a plant with these signals; `Signals` itself for those of the EHA."""
-    if declared.names == plant_signals.EHA.names:
+    if signals.names == plant_signals.EHA.names:
         return Signals
-    kept = {item.name: item for item in fields(Signals)}
-    taken = {*kept, *(item.name for item in fields(Timing))} - {*plant_signals.EHA.names}
-    for name in declared.names:
-        require(name not in taken and name.isidentifier(), "plant", f"signal {name}",
-                f"the name of a column that no row of a run has already (it has {', '.join(sorted(taken))})")
+    row_fields = {item.name: item for item in fields(Signals)}
+    used_names = {*row_fields, *(item.name for item in fields(Timing))} - {*plant_signals.EHA.names}
+    for name in signals.names:
+        require(name not in used_names and name.isidentifier(), "plant", f"signal {name}",
+                f"the name of a column that no row of a run has already (it has {', '.join(sorted(used_names))})")
     first, last = (("cycle", "phase"), ("control", "status", "flags"))
     hints = get_type_hints(Signals, include_extras=True)
 
     def keep(names: tuple[str, ...]) -> list[tuple[str, Any, Any]]:
-        return [(name, hints[name], field(metadata=dict(kept[name].metadata))) for name in names]
+        return [(name, hints[name], field(metadata=dict(row_fields[name].metadata))) for name in names]
 
-    own = [(s.name, float, describe_field(s.quantity, s.unit)) for s in declared[1:]]
-    made: Any = make_dataclass("Signals", [*keep(first), *own, *keep(last)], slots=True, namespace={"__doc__":
-                               "One cycle, decoded: row k holds the command, the sensed outputs and the drive, the "
-                               "answer to sample k. NaN: no sample."})
-    CHANNELS[made] = CHANNELS[Signals]
-    return cast("type[Signals]", made)
+    signal_fields = [(s.name, float, describe_field(s.quantity, s.unit)) for s in signals[1:]]
+    record: Any = make_dataclass("Signals", [*keep(first), *signal_fields, *keep(last)], slots=True, namespace={
+        "__doc__": "One cycle, decoded: row k holds the command, the sensed outputs and the drive, the answer to "
+                   "sample k. NaN: no sample."})
+    CHANNELS[record] = CHANNELS[Signals]
+    return cast("type[Signals]", record)
 
 
 Record = Signals | Timing | Event | NmtState | CheckResult
@@ -225,14 +225,14 @@ def _encode_varint(n: int) -> bytes:
 RECORDED_PACKAGES = ("eha-rig", "numpy", "numba", "python-can", "canopen", "mcap", "protobuf")
 
 
-def collect_provenance(**given: object) -> dict[str, str]:
-    """Collect host, time, package versions and state of the checkout; `given` adds seed, bus, pace, model.
+def collect_provenance(**entries: object) -> dict[str, str]:
+    """Collect host, time, package versions and state of the checkout; `entries` adds seed, bus, pace, model.
 
     >>> collect_provenance(seed=1)["seed"]
     '1'
     """
     return {
-        **{name: str(value) for name, value in given.items()},
+        **{name: str(value) for name, value in entries.items()},
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "host": platform.node(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}, {os.cpu_count()} processors",
@@ -244,9 +244,9 @@ def collect_provenance(**given: object) -> dict[str, str]:
 
 def read_epoch_ns() -> int:
     """The date now, ns since 1970 (UTC); SOURCE_DATE_EPOCH, whole seconds, replaces it, for logs that are equal."""
-    given = os.environ.get("SOURCE_DATE_EPOCH", "")
-    is_date = given.isascii() and given.isdecimal() and len(given) < 11
-    return int(given) * 10**9 if is_date else time.time_ns()
+    text = os.environ.get("SOURCE_DATE_EPOCH", "")
+    is_date = text.isascii() and text.isdecimal() and len(text) < 11
+    return int(text) * 10**9 if is_date else time.time_ns()
 
 
 def _read_version(name: str) -> str:
@@ -267,5 +267,5 @@ def _read_git_state(root: Path) -> dict[str, str]:
     except (OSError, subprocess.SubprocessError):
         return {}
     commit = next((line.removeprefix("# branch.oid ") for line in lines if line.startswith("# branch.oid ")), "")
-    changed = sum(not line.startswith("#") for line in lines)
-    return {"git.commit": commit, "git.state": f"{count_nouns(changed, 'file')} changed" if changed else "clean"}
+    file_count = sum(not line.startswith("#") for line in lines)
+    return {"git.commit": commit, "git.state": f"{count_nouns(file_count, 'file')} changed" if file_count else "clean"}

@@ -73,7 +73,7 @@ class CycleBlock(NamedTuple):
     def list_frames(self, cob_id: int) -> list[Frame]:
         """The frames with this COB-ID."""
         return [Frame(t_ns, cob_id, data.to_bytes(8, "little", signed=True))
-                for known, payload in self.frames if known == cob_id and payload is not None
+                for identifier, payload in self.frames if identifier == cob_id and payload is not None
                 for t_ns, data in zip(self.t_ns.tolist(), payload.tolist(), strict=True)]
 
     def make_row(self, i: int) -> tuple[Signals, Timing]:
@@ -154,14 +154,14 @@ class RecorderError(RigError):
     """The log cannot be written any more (disk full, folder gone, disk too slow). Raised once, to the loop."""
 
 
-def list_topics(declared: plant_signals.Signals = plant_signals.EHA) -> dict[str, type]:
+def list_topics(signals: plant_signals.Signals = plant_signals.EHA) -> dict[str, type]:
     """The record of each topic, for a plant with these signals."""
-    return {**TOPICS, "/signals": make_row_record(declared)}
+    return {**TOPICS, "/signals": make_row_record(signals)}
 
 
-def list_channels(declared: plant_signals.Signals = plant_signals.EHA) -> list[McapRecord]:
+def list_channels(signals: plant_signals.Signals = plant_signals.EHA) -> list[McapRecord]:
     """Schemas and channels of a log of a plant with these signals; both have the number of the channel."""
-    topics = list_topics(declared)
+    topics = list_topics(signals)
     schemas = [Schema(id=CHANNELS[record], data=encode_schema(record), encoding="protobuf",
                       name=f"eha.{record.__name__}") for record in topics.values()]
     channels = [Channel(id=CHANNELS[record], topic=topic, message_encoding="protobuf",
@@ -396,9 +396,9 @@ class McapFile:
             head = encode_records([*self.schemas.values(), *self.channels.values()])
             raw, shift, self._declared = head + raw, len(head), True
             index = {c: array("Q", (v + shift * (i & 1) for i, v in enumerate(pairs))) for c, pairs in index.items()}
-        packed = zstandard.compress(raw)
+        content = zstandard.compress(raw)
         times = [t for pairs in index.values() for t in (min(pairs[::2]), max(pairs[::2]))]
-        chunk = Chunk("zstd", packed, max(times), min(times), zlib.crc32(raw), len(raw))
+        chunk = Chunk("zstd", content, max(times), min(times), zlib.crc32(raw), len(raw))
         out = [encode_records([chunk])]
         length = len(out[0])
         where, offsets = self._offset + length, {}
@@ -408,7 +408,7 @@ class McapFile:
             body = pairs.tobytes()  # little endian on every machine this runs on
             out.append(struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(body), channel, len(body)) + body)
             where += len(out[-1])
-        self._chunks.append(ChunkIndex(length, self._offset, "zstd", len(packed), chunk.message_end_time,
+        self._chunks.append(ChunkIndex(length, self._offset, "zstd", len(content), chunk.message_end_time,
                                        where - self._offset - length, offsets, chunk.message_start_time, len(raw)))
         self._write(b"".join(out))
 
