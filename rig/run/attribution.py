@@ -116,7 +116,7 @@ class Attribution(NamedTuple):
 
 
 def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: TimingPolicy, bench: Bench,
-              gone: Mapping[Role, str]) -> Attribution:
+              gone_nodes: Mapping[Role, str]) -> Attribution:
     """Find the cycles that may be judged, and the first cause of the troubles of a run.
 
     Args:
@@ -124,18 +124,18 @@ def attribute(records: CycleRecords, troubles: Sequence[Trouble], policy: Timing
         troubles: everything that was reported, in any order.
         policy: limits of the sequence.
         bench: names the participants.
-        gone: nodes that did not answer any more at the end of the run, and how that is known.
+        gone_nodes: those that did not answer any more at the end of the run, and how that is known.
     """
-    late = find_late_cycles(records, policy, find_plant_stops(records, troubles, gone))
+    late = find_late_cycles(records, policy, find_plant_stops(records, troubles, gone_nodes))
     disturbances = find_disturbances(records, late)
-    judged, invalid = select_judged(records, late, disturbances)
-    ordered = sorted(troubles, key=lambda trouble: trouble.t_ns)
-    causes = [find_cause(trouble, records, disturbances, gone, bench) for trouble in ordered]
+    is_judged, invalid = select_judged(records, late, disturbances)
+    sorted_troubles = sorted(troubles, key=lambda trouble: trouble.t_ns)
+    causes = [find_cause(trouble, records, disturbances, gone_nodes, bench) for trouble in sorted_troubles]
     cause = find_first_cause(causes, disturbances)
-    consequences = tuple((records.find_cycle(trouble.t_ns), trouble) for trouble in ordered
+    consequences = tuple((records.find_cycle(trouble.t_ns), trouble) for trouble in sorted_troubles
                          if cause is None or trouble.text != cause.text)
-    return Attribution(judged, invalid, disturbances, cause, consequences, find_affected(records, disturbances),
-                       sum(found.is_lateness for found in causes), count_overruns(records, late))
+    return Attribution(is_judged, invalid, disturbances, cause, consequences, find_affected(records, disturbances),
+                       sum(each.is_lateness for each in causes), count_overruns(records, late))
 
 
 def find_first_cause(causes: Iterable[Cause], disturbances: Iterable[Disturbance]) -> Cause | None:
@@ -143,11 +143,12 @@ def find_first_cause(causes: Iterable[Cause], disturbances: Iterable[Disturbance
 
     Lateness makes frames come late, but it ends no process.
     """
-    ordered = sorted(causes, key=lambda cause: cause.cycle)
-    if not ordered or not ordered[0].is_lateness:
-        return ordered[0] if ordered else None
-    reach = max((late.reach for late in disturbances if late.first == ordered[0].cycle), default=ordered[0].cycle)
-    return next((cause for cause in ordered if cause.is_gone and cause.cycle <= reach), ordered[0])
+    sorted_causes = sorted(causes, key=lambda cause: cause.cycle)
+    if not sorted_causes or not sorted_causes[0].is_lateness:
+        return sorted_causes[0] if sorted_causes else None
+    reach = max((late.reach for late in disturbances if late.first == sorted_causes[0].cycle),
+                default=sorted_causes[0].cycle)
+    return next((cause for cause in sorted_causes if cause.is_gone and cause.cycle <= reach), sorted_causes[0])
 
 
 class LateCycles(NamedTuple):
@@ -185,11 +186,11 @@ def find_late_cycles(records: CycleRecords, policy: TimingPolicy, stops: Iterabl
     return LateCycles(sync, feedback, records.plant_delay > latest_feedback)
 
 
-def find_plant_stops(records: CycleRecords, troubles: Iterable[Trouble], gone: Container[int]) -> list[int]:
+def find_plant_stops(records: CycleRecords, troubles: Iterable[Trouble], gone_nodes: Container[int]) -> list[int]:
     """Cycles in which the plant was found to have stopped: it is gone, has an error of its own, or left OPERATIONAL."""
     stops = [records.find_cycle(trouble.t_ns) for trouble in troubles
              if trouble.node == PLANT and not _is_communication(trouble)]
-    return [*stops, records.cycles - 1] if PLANT in gone else stops
+    return [*stops, records.cycles - 1] if PLANT in gone_nodes else stops
 
 
 def find_start_problem(times: Mapping[Role, StartTime], limit: float, names: Mapping[Role, str],
@@ -209,14 +210,14 @@ def find_start_problem(times: Mapping[Role, StartTime], limit: float, names: Map
     """
     slow = [node for node in names
             if node not in times or times[node].seconds - times[node].waited > limit]
-    said = {node: f"took {times[node].seconds:.2f} s" if node in times else "has not said so" for node in slow}
+    reasons = {node: f"took {times[node].seconds:.2f} s" if node in times else "has not said so" for node in slow}
     rule = f"must be OPERATIONAL within {limit:g} s of NMT start"
     if len(slow) == 2:
-        which = ", ".join(f"{names[node]} {said[node]}" for node in slow)
-        return "late", f"the bench was late in bring-up: both nodes {rule}: {which}", 0
+        details = ", ".join(f"{names[node]} {reasons[node]}" for node in slow)
+        return "late", f"the bench was late in bring-up: both nodes {rule}: {details}", 0
     for node in slow:
         kind = "late" if node == PLANT and node in times else "bring_up"  # the plant is a part of the bench
-        return kind, f"{names[node]} {rule} and {said[node]}", node
+        return kind, f"{names[node]} {rule} and {reasons[node]}", node
     for node, time in times.items():
         if time.seconds > limit:
             return "late", (f"the rig stood still for {time.waited:.2f} s and cannot know whether {names[node]} "
@@ -224,12 +225,12 @@ def find_start_problem(times: Mapping[Role, StartTime], limit: float, names: Map
     return None
 
 
-def find_disturbances(records: CycleRecords, late: LateCycles, joined: int = 2) -> tuple[Disturbance, ...]:
-    """Group late cycles that are at most `joined` cycles apart: a stall of one process makes the others late too."""
+def find_disturbances(records: CycleRecords, late: LateCycles, gap: int = 2) -> tuple[Disturbance, ...]:
+    """Group late cycles that are at most `gap` cycles apart: a stall of one process makes the others late too."""
     cycles = np.flatnonzero(late.any)
     if not len(cycles):
         return ()
-    breaks = np.flatnonzero(np.diff(cycles) > joined + 1) + 1
+    breaks = np.flatnonzero(np.diff(cycles) > gap + 1) + 1
     return tuple(_describe_disturbance(records, late, int(group[0]), int(group[-1]))
                  for group in np.split(cycles, breaks))
 
@@ -237,13 +238,13 @@ def find_disturbances(records: CycleRecords, late: LateCycles, joined: int = 2) 
 def _describe_disturbance(records: CycleRecords, late: LateCycles, first: int, last: int) -> Disturbance:
     """A disturbance with its reach: three cycles, and as long again as it lasted."""
     span = slice(first, last + 1)
-    skipped = int(np.floor(np.nan_to_num(records.lateness[span]) / records.period).sum())
+    late_periods = int(np.floor(np.nan_to_num(records.lateness[span]) / records.period).sum())
     # The rig is named if its SYNC was late first: a stalled rig also takes the plant's frames in late.
     is_rig = late.sync[first] or (
         late.sync[span].any() and not late.stalled[span].any() and late.feedback[span].sum() < 2)
     late_ms = 1e3 * float(np.nanmax(records.lateness[span]))
     text = f"the rig sent SYNC {late_ms:.1f} ms late" if is_rig else _describe_plant(records, late, span)
-    return Disturbance(first, last, last + 3 + (last - first + 1) + skipped, RIG if is_rig else PLANT, text)
+    return Disturbance(first, last, last + 3 + (last - first + 1) + late_periods, RIG if is_rig else PLANT, text)
 
 
 def _describe_plant(records: CycleRecords, late: LateCycles, span: slice) -> str:
@@ -256,8 +257,8 @@ def _describe_plant(records: CycleRecords, late: LateCycles, span: slice) -> str
 
 def count_overruns(records: CycleRecords, late: LateCycles) -> NDArray[np.int64]:
     """Overruns in each cycle, (cycles,): one for a late cycle, and the whole periods that were skipped if more."""
-    skipped = np.floor(np.nan_to_num(records.lateness) / records.period).astype(np.int64)
-    return np.maximum(skipped, late.any.astype(np.int64))
+    late_periods = np.floor(np.nan_to_num(records.lateness) / records.period).astype(np.int64)
+    return np.maximum(late_periods, late.any.astype(np.int64))
 
 
 def count_most_in_a_row(overruns: NDArray[np.int64]) -> int:
@@ -276,17 +277,17 @@ def count_most_in_a_row(overruns: NDArray[np.int64]) -> int:
 def select_judged(records: CycleRecords, late: LateCycles,
                   disturbances: Iterable[Disturbance]) -> tuple[Mask, dict[str, int]]:
     """Select the cycles on which the controller may be judged; with the number of the others by reason."""
-    shortened = np.append(late.sync[1:], False)  # the whole machine may have stood still between the two SYNCs
-    following = np.zeros(records.cycles, dtype=bool)
+    is_shortened = np.append(late.sync[1:], False)  # the whole machine may have stood still between the two SYNCs
+    is_following = np.zeros(records.cycles, dtype=bool)
     for disturbance in disturbances:
-        following[disturbance.last + 1:disturbance.reach - 1] = True
-    taken = np.zeros(records.cycles, dtype=bool)
+        is_following[disturbance.last + 1:disturbance.reach - 1] = True
+    is_excluded = np.zeros(records.cycles, dtype=bool)
     counts = {}
     for reason, mask in (("sync_late", late.sync), ("feedback_late", late.feedback), ("plant_stalled", late.stalled),
-                         ("next_sync_late", shortened), ("following", following)):
-        counts[reason] = int((mask & ~taken).sum())
-        taken |= mask
-    return ~taken, counts
+                         ("next_sync_late", is_shortened), ("following", is_following)):
+        counts[reason] = int((mask & ~is_excluded).sum())
+        is_excluded |= mask
+    return ~is_excluded, counts
 
 
 def find_affected(records: CycleRecords, disturbances: Iterable[Disturbance]) -> Mask:
@@ -294,17 +295,17 @@ def find_affected(records: CycleRecords, disturbances: Iterable[Disturbance]) ->
 
     A late SYNC alone changes no signal: the plant moves one period a SYNC, however late it comes.
     """
-    affected = np.zeros(records.cycles, dtype=bool)
-    lost = np.isnan(records.feedback) | np.isnan(records.response) | (records.flags & _NO_DRIVE != 0)
+    is_affected = np.zeros(records.cycles, dtype=bool)
+    is_frame_lost = np.isnan(records.feedback) | np.isnan(records.response) | (records.flags & _NO_DRIVE != 0)
     for disturbance in disturbances:
-        cycles = disturbance.first + np.flatnonzero(lost[disturbance.first:disturbance.reach + 1])
+        cycles = disturbance.first + np.flatnonzero(is_frame_lost[disturbance.first:disturbance.reach + 1])
         if len(cycles):
-            affected[cycles[0]:cycles[-1] + _SETTLING] = True
-    return affected
+            is_affected[cycles[0]:cycles[-1] + _SETTLING] = True
+    return is_affected
 
 
-def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[Disturbance], gone: Mapping[Role, str],
-               bench: Bench) -> Cause:
+def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[Disturbance],
+               gone_nodes: Mapping[Role, str], bench: Bench) -> Cause:
     """The first cause of one trouble.
 
     What is not about communication is its own cause. Otherwise, in this order: a node that is gone explains the frames
@@ -312,23 +313,23 @@ def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[D
     falls into its reach; a node that sent no frames explains that others miss them.
     """
     cycle = records.find_cycle(trouble.t_ns)
-    itself = Cause(trouble.node, trouble.kind, cycle, trouble.text)
+    own_cause = Cause(trouble.node, trouble.kind, cycle, trouble.text)
     if not _is_communication(trouble):
-        return itself
+        return own_cause
     silent, origin = _find_silent_node(trouble, records, cycle)
     for node in (silent, trouble.node):
-        if node in gone and records.find_stop(node) <= cycle + 1:  # later it still answered
+        if node in gone_nodes and records.find_stop(node) <= cycle + 1:  # later it still answered
             role = Role(node)
-            return _describe_stop(role, bench, records, min(origin, records.find_stop(node)), cycle, gone[role])
+            return _describe_stop(role, bench, records, min(origin, records.find_stop(node)), cycle, gone_nodes[role])
     window = records.injected.any[max(origin - 1, 0):cycle + 1]
     if window.any() and trouble.kind != "guard":
-        return itself._replace(source=0, kind="injected", cycle=max(origin - 1, 0) + int(np.argmax(window)),
-                               text="a fault of the sequence disturbs frames")
+        return own_cause._replace(source=0, kind="injected", cycle=max(origin - 1, 0) + int(np.argmax(window)),
+                                  text="a fault of the sequence disturbs frames")
     for disturbance in disturbances:
         reach = disturbance.reach + (_SETTLING if trouble.kind == "guard" else 0)
         if any(disturbance.first - 1 <= at <= reach for at in (origin, cycle)):
             return Cause(disturbance.source, "late", disturbance.first, disturbance.text)
-    return _describe_stop(Role(silent), bench, records, origin, cycle, "") if silent else itself
+    return _describe_stop(Role(silent), bench, records, origin, cycle, "") if silent else own_cause
 
 
 def _is_communication(trouble: Trouble) -> bool:
@@ -358,8 +359,8 @@ def _find_silent_node(trouble: Trouble, records: CycleRecords, cycle: int) -> tu
         origin = _find_run_start(no_feedback, cycle)
         return (PLANT, origin) if no_feedback[min(origin, len(no_feedback) - 1):][:1].any() else (0, cycle)
     # The plant's flags of cycle k + 1 speak of the drive frame of cycle k.
-    flagged = np.append(records.flags[1:] & _NO_DRIVE != 0, False)[:records.cycles]
-    origin = _find_run_start(records.find_missing(CONTROLLER) | flagged, cycle)
+    is_flagged = np.append(records.flags[1:] & _NO_DRIVE != 0, False)[:records.cycles]
+    origin = _find_run_start(records.find_missing(CONTROLLER) | is_flagged, cycle)
     first = max(origin - 1, 0)
     # Without feedback the controller has nothing to answer: then the plant was first.
     return (PLANT, first) if no_feedback[first:origin + 1].any() else (CONTROLLER, origin)
@@ -410,12 +411,12 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
         watchdog_limit: cycles after which missing frames have been reported.
     """
     sync, plant, anything = (np.zeros(cycles, dtype=bool) for _ in range(3))
-    silent, cycle_ns = round(heartbeat_limit * plan.rate), round(1e9 / plan.rate)
+    silence, cycle_ns = round(heartbeat_limit * plan.rate), round(1e9 / plan.rate)
     for fault in plan.faults:
         first, last = plan.find_cycles(fault)
         frame = getattr(fault, "frame", "")
         if not frame and not isinstance(fault, Parameter | Offset | Stuck):
-            anything[first:last + silent] = True
+            anything[first:last + silence] = True
             sync[first:last + watchdog_limit] |= not isinstance(fault, Silent)
             plant[first:last + 1] |= isinstance(fault, BusOff)
         for k in range(first, min(last, cycles) if frame else first):
@@ -425,5 +426,5 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
                 anything[k:last_hit + watchdog_limit] = True
                 plant[k:last_hit + 1] |= frame in ("feedback", "valve_state", "sync")
                 sync[k:last_hit + 1] |= frame == "sync"
-                anything[k:k + silent] |= frame == "sync"
+                anything[k:k + silence] |= frame == "sync"
     return Injected(sync, plant, anything)

@@ -165,8 +165,8 @@ def find_gap(probe: History, on_time: Mask, cycles: int) -> str:
 def read_rows(history: History, on_time: Mask) -> Rows:
     """The rows of a history as the protocol checks see them."""
     signals = history.signals
-    own = {"demand": signals.command.name, "position": signals.controlled.name, "drive": signals.drive.name}
-    return Rows(on_time=on_time, **{name: history.column(own.get(name, name)) for name in Rows._fields
+    columns = {"demand": signals.command.name, "position": signals.controlled.name, "drive": signals.drive.name}
+    return Rows(on_time=on_time, **{name: history.column(columns.get(name, name)) for name in Rows._fields
                                     if name != "on_time"})
 
 
@@ -225,9 +225,9 @@ class Enabling:
         self._play_until(is_ready, lambda: at_rest, 2 * slowest + TIME_TO_SAY)
         if self._play_until(is_ready, lambda: CycleInput(1, demand, 0.0, main_control, is_counted=False)):
             return ""
-        said = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
-                         for name, value in self._bench.ready.items() if not self._has(name, value))
-        return self._describe_silence() or f"the controller is not ready after {LIMIT:g} s: {said}"
+        details = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
+                            for name, value in self._bench.ready.items() if not self._has(name, value))
+        return self._describe_silence() or f"the controller is not ready after {LIMIT:g} s: {details}"
 
     def _describe_silence(self) -> str:
         missing = describe_missing(self._bench, self._silent, self._loop.describe_refusal())
@@ -238,11 +238,11 @@ class Enabling:
 
         `most`: cycles; default what `LIMIT` allows.
         """
-        clock, left = WallClock(), most or round(LIMIT * 1e9 / self._bench.cycle_ns)
+        clock, remaining_cycles = WallClock(), most or round(LIMIT * 1e9 / self._bench.cycle_ns)
         while not is_done():
-            left -= 1
+            remaining_cycles -= 1
             is_over = clock.now() > LIMIT * 1e9 if self._realtime else self._silent >= PATIENCE
-            if left < 0 or is_over:
+            if remaining_cycles < 0 or is_over:
                 return False
             self._play(make_step())
             if self._stop():

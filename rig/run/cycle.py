@@ -116,14 +116,15 @@ class Buffers(NamedTuple):
     held: NDArray[np.int64]  # (late frames, HELD_COLUMNS), the earliest first
 
 
-def make_buffers(ahead: int, rows: int, frames: int, held: int, driven: int, channels: int, is_fd: bool) -> Buffers:
+def make_buffers(ahead: int, rows: int, frames: int, late_frames: int, settings: int, channels: int,
+                 is_fd: bool) -> Buffers:
     """Empty buffers for that many entries each, in memory that is already mapped."""
     columns = DATA + 8 if is_fd else DATA + 1
     # unlike zeros it touches every page
     return Buffers(np.full(WORDS, 0, np.int64), np.full((ahead, INPUT_COLUMNS), 0, np.int64),
-                   np.full((ahead + 1, driven), np.nan), np.full((rows, COLUMNS), 0, np.int64),
+                   np.full((ahead + 1, settings), np.nan), np.full((rows, COLUMNS), 0, np.int64),
                    np.full((rows, channels), np.nan), np.full((frames, columns), 0, np.int64),
-                   np.full((held, HELD_COLUMNS), 0, np.int64))
+                   np.full((late_frames, HELD_COLUMNS), 0, np.int64))
 
 
 def play_cycles(port: Port, buffers: Buffers, m: Layout, plant: Memory) -> None:
@@ -227,9 +228,9 @@ def _wait_until_due(port: Port, buffers: Buffers, m: Layout) -> None:
 @keep_apart
 def _sleep_until(port: Port, buffers: Buffers, m: Layout, t_ns: int) -> None:
     """Sleep until `t_ns`, and send the late frames that are due before."""
-    words, held = buffers.words, buffers.held
-    while words[HELD] > 0 and held[0, HELD_DUE] < t_ns:
-        _pause_until(port, words, held[0, HELD_DUE])
+    words, late_frames = buffers.words, buffers.held
+    while words[HELD] > 0 and late_frames[0, HELD_DUE] < t_ns:
+        _pause_until(port, words, late_frames[0, HELD_DUE])
         _release_first_held(port, buffers, m)
     _pause_until(port, words, t_ns)
 
@@ -285,15 +286,15 @@ def _send_as_fault_leaves_it(port: Port, buffers: Buffers, m: Layout, plant: Mem
 
 def _hold_frame(buffers: Buffers, m: Layout, at: int, due: int, length: int) -> None:
     """Keep the frame in the payload until its time; those that are due at the same time stay in order."""
-    words, held = buffers.words, buffers.held
+    words, late_frames = buffers.words, buffers.held
     place = words[HELD]
-    if place == len(held):
+    if place == len(late_frames):
         return
-    while place > 0 and held[place - 1, HELD_DUE] > due:
-        _copy(held[place - 1], 0, held[place], 0, HELD_COLUMNS)
+    while place > 0 and late_frames[place - 1, HELD_DUE] > due:
+        _copy(late_frames[place - 1], 0, late_frames[place], 0, HELD_COLUMNS)
         place -= 1
-    held[place, HELD_DUE], held[place, _HELD_PLACE], held[place, _HELD_LENGTH] = due, at, length
-    _copy(m.words, PAYLOAD, held[place], _HELD_DATA, 8)
+    late_frames[place, HELD_DUE], late_frames[place, _HELD_PLACE], late_frames[place, _HELD_LENGTH] = due, at, length
+    _copy(m.words, PAYLOAD, late_frames[place], _HELD_DATA, 8)
     words[HELD] += 1
 
 
@@ -306,12 +307,12 @@ def _copy(source: NDArray[np.int64], first: int, target: NDArray[np.int64], plac
 @keep_apart
 def _release_first_held(port: Port, buffers: Buffers, m: Layout) -> None:
     """Send the frame that has waited; one of the controller is received now."""
-    words, held = buffers.words, buffers.held
-    at, length = held[0, _HELD_PLACE], held[0, _HELD_LENGTH]
-    _copy(held[0], _HELD_DATA, m.words, PAYLOAD, 8)
+    words, late_frames = buffers.words, buffers.held
+    at, length = late_frames[0, _HELD_PLACE], late_frames[0, _HELD_LENGTH]
+    _copy(late_frames[0], _HELD_DATA, m.words, PAYLOAD, 8)
     words[HELD] -= 1
     for place in range(words[HELD]):
-        _copy(held[place + 1], 0, held[place], 0, HELD_COLUMNS)
+        _copy(late_frames[place + 1], 0, late_frames[place], 0, HELD_COLUMNS)
     if m.words[at + IS_MINE]:
         _send(port, buffers, m, m.words[at + SENT_AS], length, 1)
     else:
@@ -339,8 +340,8 @@ def _begin_cycle(port: Port, buffers: Buffers, m: Layout, plant: Memory, late: i
     Due times that have passed are lost.
     """
     words = buffers.words
-    lost = late // words[PERIOD]
-    words[DUE] += lost * words[PERIOD]
+    late_periods = late // words[PERIOD]
+    words[DUE] += late_periods * words[PERIOD]
     if words[SYNC_CODE] == DELAY:  # a fault, and no lateness of the bench
         _pause_until(port, words, words[DUE] + words[SYNC_ARGUMENT])
     words[SYNC_AT] = read_clock(port)
@@ -352,7 +353,7 @@ def _begin_cycle(port: Port, buffers: Buffers, m: Layout, plant: Memory, late: i
     _open_row(buffers, m, late)
     _send_frames(port, buffers, m, plant, False)
     _copy_values(buffers, m, words[DRIVEN], words[SENT_CHANNELS])
-    words[OVERRUNS] += max(lost, buffers.rows[words[ROWS] % len(buffers.rows), OVERRUN])
+    words[OVERRUNS] += max(late_periods, buffers.rows[words[ROWS] % len(buffers.rows), OVERRUN])
     if words[MOVES_PLANT] and words[COUNTED] and not words[DIVERGED]:
         if words[CYCLES] == 0:  # the plant rests until the run begins: no answer from before drives it
             plant.reals[IN_FORCE] = 0.0

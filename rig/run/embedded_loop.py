@@ -149,15 +149,15 @@ def _note_time(b: Buffers, i: int, column: int) -> None:
 
 def make_buffers(bench: Bench, m: Layout, names: Sequence[str], guards: Mapping[str, tuple[float, float]]) -> Buffers:
     """Buffers for a bench with this layout, whose values have these names. `guards`: limits by signal, SI."""
-    guarded = list_guarded(bench.signals)
-    b = Buffers(np.zeros(16, np.int64), np.zeros(_LIMITS_AT + 3 * len(guarded)), m, np.zeros((MOST, 2)),
+    guarded_signals = list_guarded(bench.signals)
+    b = Buffers(np.zeros(16, np.int64), np.zeros(_LIMITS_AT + 3 * len(guarded_signals)), m, np.zeros((MOST, 2)),
                 np.zeros((MOST, len(names))), np.zeros((MOST, 4), np.int64), np.zeros((MOST, 4), np.int64))
     places = dict(zip((each.identifier for each in bench.frames.list_of(Role.RIG)), list_frame_places(m), strict=True))
     b.words[FRAMES_AT:FRAMES_AT + 4] = [places[each.identifier] for each in list_frames(bench)]
     values = CyclicValues(bench)
     b.words[DEMAND:DRIVE_VALUE + 1] = [names.index(name) for name in (values.command, values.load, values.readings[0],
                                                                       values.drive)]
-    b.reals[_LIMITS_AT:].reshape(-1, 3)[:, 1:] = [guards.get(signal, (-np.inf, np.inf)) for signal in guarded]
+    b.reals[_LIMITS_AT:].reshape(-1, 3)[:, 1:] = [guards.get(signal, (-np.inf, np.inf)) for signal in guarded_signals]
     return b
 
 
@@ -169,13 +169,13 @@ def list_guarded(signals: Signals) -> tuple[str, ...]:
 
 def list_frames(bench: Bench) -> list[FrameSpec]:
     """The frames of a cycle in the order of the payloads; empty unless there is one of each kind, in each cycle."""
-    found = [each for role in ("command", "feedback", "valve_state", "drive")
-             for each in bench.frames.frames if role in each.roles]
-    known = {bench.signals.command.word, *(s.word for s in bench.signals.outputs), bench.signals.drive.word,
+    frames = [each for role in ("command", "feedback", "valve_state", "drive")
+              for each in bench.frames.frames if role in each.roles]
+    names = {bench.signals.command.word, *(s.word for s in bench.signals.outputs), bench.signals.drive.word,
              "control_word", "status_word", "flags", "cycle"}  # what our own nodes put into frames
-    is_plain = all(each.every == 1 and each.length == 8 and {one.name for one in each.fields} <= known
-                   for each in found)
-    return found if is_plain and len(bench.frames.frames) == len(set(found)) == len(found) == 4 else []
+    is_plain = all(each.every == 1 and each.length == 8 and {field.name for field in each.fields} <= names
+                   for each in frames)
+    return frames if is_plain and len(bench.frames.frames) == len(set(frames)) == len(frames) == 4 else []
 
 
 def make_trial() -> tuple[Port, Buffers, Memory]:
@@ -233,20 +233,20 @@ class EmbeddedLoop(CycleLoop):
             self._shared, self._run_quiet = plant, load_code().bind((self._port, self._quiet, plant))
         self._end()
         b = self._quiet
-        given = self._values.list_given(CycleInput(phase, 0.0, 0.0, control))
+        values = self._values.list_given(CycleInput(phase, 0.0, 0.0, control))
         at = b.layout.words[VALUES_AT] + 2  # demand and load are those of each cycle
-        b.layout.doubles[at:at + len(given) - 2] = given[2:]
+        b.layout.doubles[at:at + len(values) - 2] = values[2:]
         b.words[ASKED], b.words[FIRST] = most, self.k
         b.reals[LOOP:GAINS], b.reals[GAINS:_LIMITS_AT] = firmware.loop, firmware.gains
         b.inputs[:most, 0], b.inputs[:most, 1] = demands[:most], loads[:most]
         self._run_quiet()
-        played = int(b.words[DONE])
-        if played:
+        count = int(b.words[DONE])
+        if count:
             firmware.loop = Loop(*b.reals[LOOP:GAINS].tolist())
-            emulator.pass_quiet(played, int(b.payloads[played - 1, DRIVE]))
-            self._take_cycles(phase, control, played)
+            emulator.pass_quiet(count, int(b.payloads[count - 1, DRIVE]))
+            self._take_cycles(phase, control, count)
             self._run_timers(emulator, firmware)
-        return played
+        return count
 
     def _count_quiet(self, emulator: Emulator, firmware: Firmware, control: int, most: int) -> int:
         """How many of the cycles to come are quiet, at most `most`; the last may be one in which a timer runs out."""
@@ -259,45 +259,45 @@ class EmbeddedLoop(CycleLoop):
         busy = self._busy[np.searchsorted(self._busy, self.k):][:1]
         return int(min(most, max(due - self._t_ns, 0) // self._period + 1, *(busy - self.k).tolist()))
 
-    def _take_cycles(self, phase: int, control: int, played: int) -> None:
+    def _take_cycles(self, phase: int, control: int, count: int) -> None:
         """Log the cycles that were played, all but the last, which is the cycle under way now."""
         b, names, first, signals = self._quiet, self._values.names, self.k, self._bench.signals
-        begun, sync, plant, drive = b.times[:played].T
-        values = dict(zip(names, b.values[:played].T.copy(), strict=True))
-        fed, answered = (plant - sync) * 1e-9, (drive - sync) * 1e-9
+        begin, sync, plant, drive = b.times[:count].T
+        values = dict(zip(names, b.values[:count].T.copy(), strict=True))
+        feedback, response = (plant - sync) * 1e-9, (drive - sync) * 1e-9
         columns = {
-            "cycle": first + np.arange(played), "phase": phase,
+            "cycle": first + np.arange(count), "phase": phase,
             **{s.name: values[s.word] for s in signals[1:] if s.role != "load"},
-            **({signals.load.name: b.inputs[:played, 1].copy()} if signals.load else {}), "control": control,
+            **({signals.load.name: b.inputs[:count, 1].copy()} if signals.load else {}), "control": control,
             "status": values["status_word"].astype(np.int64), "flags": values["flags"].astype(np.int64),
-            "overrun": False, "lateness": 0.0, "response": answered, "work": answered, "feedback_response": fed,
-            "valve_response": fed, "execution": (sync - begun) * 1e-9}
+            "overrun": False, "lateness": 0.0, "response": response, "work": response, "feedback_response": feedback,
+            "valve_response": feedback, "execution": (sync - begin) * 1e-9}
         identifiers = [frame.identifier for frame in self._frames]
-        command, *answers = zip(identifiers, b.payloads[:played].T.copy(), strict=True)
+        command, *answers = zip(identifiers, b.payloads[:count].T.copy(), strict=True)
         frames = [command, (self._sync_id, None), *answers]
-        block = CycleBlock(self._t_ns + self._period * np.arange(played), frames, columns, make_row_record(signals))
+        block = CycleBlock(self._t_ns + self._period * np.arange(count), frames, columns, make_row_record(signals))
         self._log.cycles(block)
-        demand, load = b.inputs[played - 1, :2].tolist()
-        self._open_last(CycleInput(phase, demand, load, control), played)
+        demand, load = b.inputs[count - 1, :2].tolist()
+        self._open_last(CycleInput(phase, demand, load, control), count)
 
-    def _open_last(self, step: CycleInput, played: int) -> None:
+    def _open_last(self, step: CycleInput, count: int) -> None:
         """The last of the cycles that were played is the cycle under way now, whose answers have come."""
-        words, b, last = self._words, self._quiet, played - 1
+        words, b, last = self._words, self._quiet, count - 1
         self._push(step)
         words[cy.POSITION] = words[cy.HEAD]
         words[cy.HEAD] = words[cy.TAIL]
         self.k, self._t_ns = self.k + last, self._t_ns + last * self._period
         number = words[cy.ROWS] % len(self._buffers.rows)
-        begun, sync, plant, drive = b.times[last]
+        begin, sync, plant, drive = b.times[last]
         self._buffers.rows[number] = (self.k, words[cy.POSITION], 0, 1, self._t_ns, 0, 0, 0, plant - sync, plant - sync,
                                       drive - sync, drive - sync, 0)
         self._buffers.values[number] = b.values[last]
-        words[cy.OPEN], words[cy.ROW_CYCLE], words[cy.WORKED] = 1, self.k, sync - begun
+        words[cy.OPEN], words[cy.ROW_CYCLE], words[cy.WORKED] = 1, self.k, sync - begin
         words[cy.CAME], words[cy.AWAITED], words[cy.IS_LATE] = self._answered, 0, 0
-        words[cy.HAS_BEGUN] += played
-        words[cy.PLAYED] += played
-        words[cy.CYCLES] += played
-        words[cy.DUE] += played * self._period
+        words[cy.HAS_BEGUN] += count
+        words[cy.PLAYED] += count
+        words[cy.CYCLES] += count
+        words[cy.DUE] += count * self._period
         self._layout.words[self._places + LAST_CYCLE] = words[cy.HAS_BEGUN] - 1
 
     def _run_timers(self, emulator: Emulator, firmware: Firmware) -> None:

@@ -8,7 +8,7 @@ def find_visible_steps(model: Model, resolution: float) -> dict[str, float]:
 
     They come from the bench and are no effect that the model lacks.
     """
-    offered = {effect.name for effect in model.kind.list_effects()}
+    names = {effect.name for effect in model.kind.list_effects()}
     noise = model.nominal.get(model.kind.signals.controlled.noise, 0.0)
-    is_visible = "quantisation" in offered - {*model.effects} and resolution > 0.5 * noise
+    is_visible = "quantisation" in names - {*model.effects} and resolution > 0.5 * noise
     return {"quantisation.lsb": resolution} if is_visible else {}

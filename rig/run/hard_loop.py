@@ -211,6 +211,6 @@ class HardLoop(Loop):
             self._write_frame(Frame(self._last_t_ns, frame.cob_id, frame.data))
         del self._frames[:count]
 
-    def _take_row(self, row: list[int], said: dict[str, float]) -> None:
-        self.outputs = said
-        super()._take_row(row, said)
+    def _take_row(self, row: list[int], values: dict[str, float]) -> None:
+        self.outputs = values
+        super()._take_row(row, values)

@@ -111,13 +111,13 @@ class Job(RunSettings):
 
     def build_attachments(self) -> dict[str, tuple[str, bytes]]:
         """What a log carries so that the run can be repeated: name to (media type, bytes)."""
-        own = self.model.kind
+        kind = self.model.kind
         return {
             "model.toml": ("application/toml", self.model.to_toml().encode()),
             **{_SEQUENCE_FOLDER + name: ("text/plain", data) for name, data in self.sequence.bundle().items()},
             **{_EFFECT_FOLDER + path.name: ("text/x-python", path.read_bytes()) for path in self.effects},
-            **{_PLANT_FOLDER + path.name: ("text/plain", own.source or path.read_bytes())
-               for path in ((own.file, Path(own.key)) if own.foreign else (own.file,)) if path is not None},
+            **{_PLANT_FOLDER + path.name: ("text/plain", kind.source or path.read_bytes())
+               for path in ((kind.file, Path(kind.key)) if kind.foreign else (kind.file,)) if path is not None},
             **{_BENCH_FOLDER + name: ("text/plain", data) for name, data in self.bench.files.items()}}
 
     def list_settings(self) -> dict[str, object]:
@@ -127,9 +127,9 @@ class Job(RunSettings):
                 "sequence": self.sequence.title, "period": self.period_ns / 1e9}
 
 
-def replace_settings(job: Job, **given: Any) -> Job:
+def replace_settings(job: Job, **settings: Any) -> Job:
     """The job with the settings that are not None."""
-    return replace(job, **{key: value for key, value in given.items() if value is not None})
+    return replace(job, **{key: value for key, value in settings.items() if value is not None})
 
 
 def require_bench_cycle(model: Model, bench: Bench, where: object) -> None:
@@ -155,11 +155,11 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
             trusted.
     """
     trace = Trace.read(path, all=True)
-    attachments, said = trace.attachments, trace.provenance
+    attachments, provenance = trace.attachments, trace.provenance
     bundle = {name.removeprefix(_SEQUENCE_FOLDER): data for name, data in attachments.items()
               if name.startswith(_SEQUENCE_FOLDER)}
-    settings = {each.name: said[each.name] for each in fields(RunSettings) if each.name in said}
-    require("model.toml" in attachments and bundle and len(settings) == len(fields(RunSettings)), path, "attachments",
+    texts = {each.name: provenance[each.name] for each in fields(RunSettings) if each.name in provenance}
+    require("model.toml" in attachments and bundle and len(texts) == len(fields(RunSettings)), path, "attachments",
             "the sequence and the model of a run; only logs of `rig run` have them")
     effect_codes = [ForeignCode(name, content) for name, content in attachments.items()
                     if name.startswith(_EFFECT_FOLDER)]
@@ -169,8 +169,8 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
                                             for name, content in bundle.items() if name.endswith(".py"))]
     for name in (*(code.name for code in codes), *(_SEQUENCE_FOLDER + name for name in bundle if name[-5:] == ".toml")):
         _require_file_name(path, name)
-    chosen = build_dataclass(RunSettings, {name: _read_number(text) for name, text in settings.items()},
-                             Place(f"{path}: metadata run"))
+    settings = build_dataclass(RunSettings, {name: _read_number(text) for name, text in texts.items()},
+                               Place(f"{path}: metadata run"))
     require_trust(path, codes, is_trusted=is_trusted, announce=announce)
     where = f"{path}: model.toml"
     try:
@@ -183,10 +183,10 @@ def read_job(path: Path, *, is_trusted: bool = False, announce: Announce = print
     for code, file in zip(effect_codes, effects, strict=True):
         load_effects(file, code.content)
     model = parse_model(tables, where)
-    bench = _read_bench(attachments, said.get("bench", ""), model.kind.signals, is_trusted=is_trusted)
+    bench = _read_bench(attachments, provenance.get("bench", ""), model.kind.signals, is_trusted=is_trusted)
     require_bench_cycle(model, bench, where)
     sequence = Sequence.from_bundle(bundle, bench.rate, model.plant)
-    return Job(sequence=sequence, model=model, bench=bench, effects=effects, **asdict(chosen))
+    return Job(sequence=sequence, model=model, bench=bench, effects=effects, **asdict(settings))
 
 
 def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announce = print_on_standard_error) -> str:
@@ -202,28 +202,29 @@ def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announc
         tables = parse_toml(log.attachments.get("model.toml", b"").decode(), f"{path}: model.toml")
     except (InputError, UnicodeDecodeError):  # whoever reads it as a trace says what is wrong
         return ""
-    named = str(tables.get("plant", ""))
+    plant_name = str(tables.get("plant", ""))
     codes = [ForeignCode(name, content) for name, content in log.attachments.items() if name.startswith(_PLANT_FOLDER)]
     if not codes:
-        return named
+        return plant_name
     for code in codes:
         _require_file_name(path, code.name)
     require_trust(path, codes, is_trusted=is_trusted, announce=announce)
-    return _load_stored_plant(codes, named)
+    return _load_stored_plant(codes, plant_name)
 
 
-def _load_stored_plant(codes: list[ForeignCode], named: str, *, keeps_name: bool = False) -> str:
+def _load_stored_plant(codes: list[ForeignCode], plant_name: str, *, keeps_name: bool = False) -> str:
     """Load the plant that a log calls so, from the files in it; what models call it from now on.
 
     That is the path of a file which other processes can read, or, with `keeps_name`, its name in the log.
     """
     files = dict(zip(codes, _store_code(codes), strict=True))
-    code = next((code for code in codes if Path(code.name).name == Path(named).name), codes[0])
+    code = next((code for code in codes if Path(code.name).name == Path(plant_name).name), codes[0])
     file = files[code]
     if file.suffix != ".py":
         return str(read_named_plant(str(file), file))
-    is_same = Path(named).is_file() and Path(named).read_bytes() == code.content
-    return load_plant(Path(named) if is_same else file, code.content, named if keeps_name or is_same else "").key
+    is_same = Path(plant_name).is_file() and Path(plant_name).read_bytes() == code.content
+    return load_plant(Path(plant_name) if is_same else file, code.content,
+                      plant_name if keeps_name or is_same else "").key
 
 
 def _read_bench(attachments: Mapping[str, bytes], name: str, signals: Signals, *, is_trusted: bool) -> Bench:
@@ -240,17 +241,19 @@ def _read_bench(attachments: Mapping[str, bytes], name: str, signals: Signals, *
 
 def speaks_as_shipped(bench: Bench) -> bool:
     """Whether our own firmware is a controller of this bench: frames and nodes are those of the shipped one."""
-    own, shipped = (([asdict(frame) for frame in each.frames.frames], each.frames.sync,
-                     {role: node.node for role, node in each.nodes.items()}) for each in (bench, load_bench()))
-    return own == shipped
+    layout, shipped_layout = (
+        ([asdict(frame) for frame in each.frames.frames], each.frames.sync,
+         {role: node.node for role, node in each.nodes.items()}) for each in (bench, load_bench()))
+    return layout == shipped_layout
 
 
 def _require_file_name(log: Path, name: str) -> None:
     """Refuse an attachment whose name, below its folder, cannot be that of a plain file on every machine."""
     plain = name.partition("/")[2]
     if not plain.isprintable() or "/" in plain or "\\" in plain or plain.startswith(".") or not 0 < len(plain) <= 100:
-        shown = name if len(name) <= 100 else f"{name[:100]}.. ({len(name)} characters)"
-        raise InputError(log, f"attachment {shown!r}", "the name of a file, without folders, of at most 100 characters")
+        short_name = name if len(name) <= 100 else f"{name[:100]}.. ({len(name)} characters)"
+        raise InputError(log, f"attachment {short_name!r}",
+                         "the name of a file, without folders, of at most 100 characters")
 
 
 def _read_number(text: str) -> object:
@@ -323,17 +326,17 @@ def load_tested_model(choice: JobChoice, *, is_trusted: bool = False, announce: 
     name = choice.model or bench.plant
     for file in choice.effects:
         load_effects(file)
-    brought = load_effects_of_model(name, choice.effects, is_trusted=is_trusted, announce=announce)
-    return bench, load_model(name), brought
+    effect_files = load_effects_of_model(name, choice.effects, is_trusted=is_trusted, announce=announce)
+    return bench, load_model(name), effect_files
 
 
-def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: bool = False,
+def build_job(choice: JobChoice, sequence: Sequence | None = None, *, is_trusted: bool = False,
               announce: Announce = print_on_standard_error) -> Job:
     """The job that a user chose; his model and changes override the sequence's own.
 
     Args:
         choice: what he chose.
-        built: the sequence, if it is not to be read from the file that he chose.
+        sequence: given if it is not to be read from the file that he chose.
         is_trusted: whether effect files that a model file names may run.
         announce: gets a line about each of these before it runs.
 
@@ -341,15 +344,15 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
         InputError: a sequence, model, effect or value that cannot be used.
     """
     require_different_names(choice.effects)
-    bench, model, brought = load_tested_model(choice, is_trusted=is_trusted, announce=announce)
-    sequence = load_sequence(choice.sequence, bench.rate, model.plant) if built is None else built
+    bench, model, effect_files = load_tested_model(choice, is_trusted=is_trusted, announce=announce)
+    sequence = load_sequence(choice.sequence, bench.rate, model.plant) if sequence is None else sequence
     is_own_plant = sequence.plant in (model.plant, "eha") or choice.model is not None or sequence.model.name != "eha"
     require(is_own_plant, sequence.name, "plant", f"a bench or model of {sequence.plant}, not of {model.plant}")
     if choice.model is None and sequence.model.name != "eha":
-        own = choice._replace(model=sequence.model.name)
-        bench, model, more = load_tested_model(own, is_trusted=is_trusted, announce=announce)
-        brought = (*brought, *more)
-    require_different_names((*choice.effects, *brought))
+        plant_choice = choice._replace(model=sequence.model.name)
+        bench, model, more_files = load_tested_model(plant_choice, is_trusted=is_trusted, announce=announce)
+        effect_files = (*effect_files, *more_files)
+    require_different_names((*choice.effects, *effect_files))
     model = model.replace(sequence.model.overrides, sequence.name).replace(choice.changes)
     require_bench_cycle(model, bench, "--set")
     foreign = [name for name in model.list_changes() if name.startswith("controller.") and name != "controller.period"]
@@ -358,7 +361,7 @@ def build_job(choice: JobChoice, built: Sequence | None = None, *, is_trusted: b
     plant = choice.plant or ("auto" if is_ours or not bench.has_plant_node else "external")
     require(controller != "external" or not foreign, "--set", "".join(foreign[:1]),
             "no gains beside --controller external: that firmware has its own")
-    job = Job(sequence=sequence, model=model, bench=bench, seed=choice.seed, effects=(*choice.effects, *brought),
+    job = Job(sequence=sequence, model=model, bench=bench, seed=choice.seed, effects=(*choice.effects, *effect_files),
               bus=choice.bus, controller=controller, plant=plant, max_overruns=sequence.timing.share)
     return replace_settings(job, pace=choice.pace, max_overruns=choice.max_overruns)
 
@@ -376,11 +379,11 @@ def find_differences(job: Job) -> dict[str, Any]:
     files = [path.name for path in job.effects]
     faults = [f"{fault.label!r} from {fault.start:g} s" + ("" if fault.end is None else f" to {fault.end:g} s")
               for fault in job.sequence.faults]
-    changed = {parameter.partition(".")[0] for parameter in parameters}
+    groups = {parameter.partition(".")[0] for parameter in parameters}
     words = [*([f"model {name}"] if name else []),
              *(f"{parameter} = {find_quantity(parameter, plant=model.plant).describe(value)}"
                for parameter, value in parameters.items()),
-             *(f"effect {effect}" for effect in model.effects if effect not in changed),
+             *(f"effect {effect}" for effect in model.effects if effect not in groups),
              *(f"effects of {file}" for file in files), *(f"fault {text}" for text in faults)]
     return {"model": name, "parameters": parameters, "effects": [*model.effects], "effect_files": files,
             "faults": faults, "text": "; ".join(words) or "nothing"}

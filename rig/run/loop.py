@@ -55,14 +55,14 @@ class CyclicValues:
         self.load = _NO_LOAD if signals.load is None else signals.load.word
         self.readings = tuple(s.word for s in signals.outputs)  # in the order of the transducers
         self.given = (self.command, self.load, "control_word", "mode", *bench.phases)
-        read = (*self.readings, "flags")
-        self.sent = self.given if bench.has_plant_node else (*self.given, *read)
-        received = [name for name in (*read, self.drive, *RIG_OUTPUTS, *bench.ready)
-                    if name not in self.sent and name != "cycle"]
-        self.names = (*self.sent, *dict.fromkeys(received))
+        plant_names = (*self.readings, "flags")
+        self.sent = self.given if bench.has_plant_node else (*self.given, *plant_names)
+        received_names = [name for name in (*plant_names, self.drive, *RIG_OUTPUTS, *bench.ready)
+                          if name not in self.sent and name != "cycle"]
+        self.names = (*self.sent, *dict.fromkeys(received_names))
         self.place = {name: i for i, name in enumerate(self.names)}
-        fed = {each.name for spec in bench.frames.frames if "feedback" in spec.roles for each in spec.fields}
-        role = {signals.drive.name: "drive", **{s.name: "feedback" if s.word in fed else "valve_state"
+        feedback_words = {each.name for spec in bench.frames.frames if "feedback" in spec.roles for each in spec.fields}
+        role = {signals.drive.name: "drive", **{s.name: "feedback" if s.word in feedback_words else "valve_state"
                                                 for s in signals.outputs}}
         self._columns = [(s.name, s.word, role.get(s.name, "")) for s in signals[1:]]  # and the frame that brings each
         self._given = [s.name for s in (signals.command, signals.load) if s is not None]
@@ -242,21 +242,21 @@ class Loop(ABC):
         """Log the cycles that are complete."""
         words, buffers = self._words, self._buffers
         first, last = int(words[cy.ROWS_READ]), int(words[cy.ROWS])
-        values = read_ring(buffers.values, first, last)
-        for row, said in zip(read_ring(buffers.rows, first, last), values, strict=True):
+        value_rows = read_ring(buffers.values, first, last)
+        for row, values in zip(read_ring(buffers.rows, first, last), value_rows, strict=True):
             words[cy.ROWS_READ] += 1
-            self._take_row(row, dict(zip(self._values.names, said, strict=True)))
+            self._take_row(row, dict(zip(self._values.names, values, strict=True)))
 
-    def _take_row(self, row: list[int], said: dict[str, float]) -> None:
+    def _take_row(self, row: list[int], values: dict[str, float]) -> None:
         """Log a cycle."""
         if not row[cy.IS_COUNTED]:
             return
         step = self._inputs[row[cy.INPUT] % len(self._inputs)]
         phase = self._idle_phase if row[cy.INPUT_HELD] and self._idle_phase else step.phase
         roles = {role for role, bit in packing.BITS.items() if row[cy.ANSWERS] & bit}
-        signals = self._values.open_row(row[cy.CYCLE], phase, said[self._values.command], step.load,
-                                        int(said["control_word"]))
-        self._values.fill_row(signals, said, roles)
+        signals = self._values.open_row(row[cy.CYCLE], phase, values[self._values.command], step.load,
+                                        int(values["control_word"]))
+        self._values.fill_row(signals, values, roles)
         timing = Timing(
             row[cy.CYCLE], bool(row[cy.OVERRUN]), row[cy.LATENESS] * 1e-9,
             row[cy.DRIVE_AT] * 1e-9 if row[cy.DRIVE_AT] else nan,
@@ -334,11 +334,11 @@ class CycleLoop(Loop):
         lateness = self._wait_until_due()
         self._end()
         master, k = self._master, self.k
-        began = self._wall.now()
+        begin = self._wall.now()
         self._push(step)
         self._draw_noise()
         set_rig_faults(master, self._faults, k)
-        reported = master.count_emergencies(Role.PLANT) if self._bench.has_plant_node else 0
+        emergencies = master.count_emergencies(Role.PLANT) if self._bench.has_plant_node else 0
         self._play(cy.FIRST)
         fault = self._faults.find_action("sync", k)
         delay = fault.argument if fault.code == DELAY else 0
@@ -346,10 +346,10 @@ class CycleLoop(Loop):
             self._wire.run_until(self._t_ns + delay)
         self._plant_left, self._drives_left = self._count_repeated_frames(k) if self._link is not None else (0, 0)
         self._play(cy.SYNC, lateness)
-        self._words[cy.WORKED] = self._wall.now() - began
+        self._words[cy.WORKED] = self._wall.now() - begin
         if not self._realtime:
             self._wait_for_answers(None if fault.code == DROP and self._words[cy.SYNC_ID] >= 0 else delay)
-            self._wait_for_report(reported)
+            self._wait_for_report(emergencies)
             self._play(cy.LATE, self._t_ns + self._period)
         master.tick()
         self._finish_cycle()
@@ -440,19 +440,19 @@ class CycleLoop(Loop):
         if not (is_second or any(each[0].code == DOUBLE for each in (feedback, valve))):
             return 0, 0
         copies = {DROP: 0, DELAY: 0, DOUBLE: 2}
-        answered = sum(copies.get(action.code, 1) for action in feedback if action.code != CUT)
-        return sum(copies.get(action.code, 1) for action in feedback + valve), answered
+        drive_count = sum(copies.get(action.code, 1) for action in feedback if action.code != CUT)
+        return sum(copies.get(action.code, 1) for action in feedback + valve), drive_count
 
-    def _wait_for_report(self, reported: int) -> None:
+    def _wait_for_report(self, emergencies: int) -> None:
         """Lockstep between programs: the first drive frame that a fault cuts is reported by the plant in its own time.
 
-        `reported`: EMCYs of the plant before this cycle.
+        `emergencies`: EMCYs of the plant before this cycle.
         """
         master, link = self._master, self._link
         if link is None or not self._bench.has_plant_node:
             return
         if [self._faults.find_action("drive", k).code == CUT for k in (self.k - 1, self.k)] == [False, True]:
-            link.wait(lambda: master.count_emergencies(Role.PLANT) > reported or link.is_node_gone(), link.grace)
+            link.wait(lambda: master.count_emergencies(Role.PLANT) > emergencies or link.is_node_gone(), link.grace)
 
 
 def set_rig_faults(master: Master, faults: Schedule, k: int) -> None:

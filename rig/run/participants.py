@@ -86,9 +86,9 @@ def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
 
 def _require_time(job: Job) -> None:
     """Refuse faults that nodes notice by the time, where there is none: in lockstep between processes."""
-    timed = [fault.label for fault in job.sequence.faults if is_noticed_by_time(fault)]
-    if timed and not job.realtime:
-        raise InputError("--pace", "lockstep", f"realtime, or the embedded bus, for the fault {timed[0]!r}: in "
+    labels = [fault.label for fault in job.sequence.faults if is_noticed_by_time(fault)]
+    if labels and not job.realtime:
+        raise InputError("--pace", "lockstep", f"realtime, or the embedded bus, for the fault {labels[0]!r}: in "
                                                "lockstep between processes nodes watch neither SYNC nor heartbeats")
 
 
@@ -108,19 +108,19 @@ def _start_missing_nodes(job: Job, master: Master, processes: NodeProcesses, riv
     bench = job.bench
     if master.hears_rival(rival_time):  # before sending anything: a reset would end the other rig's test
         raise BusError(f"another rig is active on {job.bus}: received a frame of {bench.describe_node(RIG)}")
-    for node, wanted in ((PLANT, job.plant), (CONTROLLER, job.controller)):
+    for node, choice in ((PLANT, job.plant), (CONTROLLER, job.controller)):
         if node not in bench.nodes:
             continue
         name, number = bench.describe_node(node), bench.find_number(node)
-        limit = external_boot_time if wanted == "external" else boot_time
-        there = (wanted != "builtin" or node == CONTROLLER) and master.is_present(node, limit)
-        if wanted == "external" and not there:
+        limit = external_boot_time if choice == "external" else boot_time
+        is_present = (choice != "builtin" or node == CONTROLLER) and master.is_present(node, limit)
+        if choice == "external" and not is_present:
             raise BusError(f"{name} does not answer on {job.bus}")
-        if node == CONTROLLER and wanted != "external" and there:
+        if node == CONTROLLER and choice != "external" and is_present:
             raise BusError(f"a node {number} is on {job.bus} already: say --controller external, or stop it")
-        if not there:
+        if not is_present:
             processes.start(node, _make_command(job, node))
-            if is_replaced(master, node, processes) and wanted != "auto":
+            if is_replaced(master, node, processes) and choice != "auto":
                 raise BusError(f"a {name} is on {job.bus} already: stop it, or say "
                                f"--{NAMES[node]} external")
 
@@ -148,10 +148,11 @@ def make_node_command(node: Role, bus: str, *words: str, is_in_c: bool = False) 
 
 def _make_command(job: Job, node: Role) -> list[str]:
     """The command that runs a node of this job."""
-    given = find_firmware_parameters(job.model) if node == CONTROLLER else {}  # all else about the model comes by SDO
+    # all else about the model comes by SDO
+    parameters = find_firmware_parameters(job.model) if node == CONTROLLER else {}
     words = [*(word for path in job.effects for word in ("--effects", str(path))),
              *(["--model", job.model.plant] if node == PLANT and job.model.kind.foreign is not None else []),
-             *(word for parameter, value in given.items() for word in ("--set", f"{parameter}={value!r}"))]
+             *(word for parameter, value in parameters.items() for word in ("--set", f"{parameter}={value!r}"))]
     return make_node_command(node, job.bus, *words, is_in_c=node == CONTROLLER and job.controller == "c")
 
 

@@ -35,12 +35,12 @@ def raise_priority(priority: int = LOOP_PRIORITY) -> Iterator[None]:
     interpreter lock, other programs must not keep it from going on, for the loop would wait with it. A thread that has
     a real-time priority keeps it: a compiled loop that runs already (`enter_loop_thread`) is not to be slowed down.
     """
-    raised = [*(thread for thread in _list_other_threads() if _is_ordinary(thread) and _set_fifo(thread, 1)),
-              *([0] if _set_fifo(0, priority) else [])]
+    threads = [*(thread for thread in _list_other_threads() if _is_ordinary(thread) and _set_fifo(thread, 1)),
+               *([0] if _set_fifo(0, priority) else [])]
     try:
         yield
     finally:
-        for thread in raised:
+        for thread in threads:
             _is_granted(os.sched_setscheduler, thread, os.SCHED_OTHER, os.sched_param(0))
 
 
@@ -53,16 +53,16 @@ def enter_loop_thread(from_last: int = 2) -> Iterator[str]:
     """
     _set_fifo(0, LOOP_PRIORITY)
     cpus = list_cpus()
-    moved = []
+    threads = []
     if len(cpus) > 1:
-        own = cpus[-min(from_last, len(cpus))]
-        rest = [cpu for cpu in cpus if cpu != own]
-        moved = [thread for thread in _list_other_threads() if _set_cpus(thread, rest)]
-        _set_cpus(0, [own])
+        loop_cpu = cpus[-min(from_last, len(cpus))]
+        rest = [cpu for cpu in cpus if cpu != loop_cpu]
+        threads = [thread for thread in _list_other_threads() if _set_cpus(thread, rest)]
+        _set_cpus(0, [loop_cpu])
     try:
         yield name_scheduler()
     finally:
-        for thread in [0, *moved]:
+        for thread in [0, *threads]:
             _set_cpus(thread, cpus)
 
 
@@ -109,14 +109,14 @@ def suspend_garbage_collection() -> Iterator[None]:
 
     By default it may keep the lock for 5 ms, five cycles, while the loop waits for it.
     """
-    collecting, interval = gc.isenabled(), sys.getswitchinterval()
+    is_collecting, interval = gc.isenabled(), sys.getswitchinterval()
     gc.disable()
     sys.setswitchinterval(SWITCH_INTERVAL)
     try:
         yield
     finally:
         sys.setswitchinterval(interval)
-        if collecting:
+        if is_collecting:
             gc.enable()
 
 
@@ -158,10 +158,10 @@ def name_scheduler() -> str:
 
 def compute_percentiles(seconds: NDArray[np.floating]) -> dict[str, float]:
     """p50, p99, p99.9 and the largest of the times that are not missing, us; nothing if all are."""
-    known = seconds[~np.isnan(seconds)] * 1e6
-    if not len(known):
+    times = seconds[~np.isnan(seconds)] * 1e6
+    if not len(times):
         return {}
-    return dict(zip(PERCENTILES, np.percentile(known, (50, 99, 99.9, 100)).tolist(), strict=True))
+    return dict(zip(PERCENTILES, np.percentile(times, (50, 99, 99.9, 100)).tolist(), strict=True))
 
 
 def is_fifo_granted() -> bool:

@@ -74,8 +74,8 @@ class LimitReached(NamedTuple):
         """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
         signal = signals.find(self.signal)
         words = f"{signal.phrase} at its {'limit' if signal.role == 'drive' else 'stop'}"
-        shown = signals.controlled if signal.unit == signals.controlled.unit else signal
-        return (f"{words} ({shown.shown_scale * self.limit:.3g} {shown.shown_unit}) for "
+        unit_signal = signals.controlled if signal.unit == signals.controlled.unit else signal
+        return (f"{words} ({unit_signal.shown_scale * self.limit:.3g} {unit_signal.shown_unit}) for "
                 f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")
 
 
@@ -145,9 +145,10 @@ class Outcome:
             return problem
         if self.aborted or not self.failures:
             return ""
-        failed = self._list_checks("FAIL")
+        failed_checks = self._list_checks("FAIL")
         is_fault_found = has_fault(self.fdi)
-        is_affected = (len(failed) + is_fault_found == len(self.failures) and all(map(self._is_affected, failed))
+        is_affected = (len(failed_checks) + is_fault_found == len(self.failures)
+                       and all(map(self._is_affected, failed_checks))
                        and (not is_fault_found or bool(self.attribution.affected.any())))
         if self.attribution.by_bench or is_affected:
             return (f"the bench was late, and the checks that failed depend on it: {'; '.join(self.failures)}; "
@@ -163,13 +164,13 @@ class Outcome:
         total, most, cycles = int(overruns.sum()), policy.most_in_a_row, self.timing["cycles"]
         if self.job.max_overruns < 1 and total > self.job.max_overruns * cycles:
             # a run that skipped periods has more overruns than cycles
-            found = (f"{count_nouns(total, 'overrun')} in {count_nouns(cycles, 'cycle')}, "
-                     f"more than {100 * self.job.max_overruns:g} %:")
+            excess = (f"{count_nouns(total, 'overrun')} in {count_nouns(cycles, 'cycle')}, "
+                      f"more than {100 * self.job.max_overruns:g} %:")
         elif most is not None and (in_a_row := count_most_in_a_row(overruns)) > most:
-            found = f"{count_nouns(in_a_row, 'overrun')} in a row, limit {most}:"
+            excess = f"{count_nouns(in_a_row, 'overrun')} in a row, limit {most}:"
         else:
             return ""
-        return (f"the bench itself was late: {found} the controller cannot be judged; "
+        return (f"the bench itself was late: {excess} the controller cannot be judged; "
                 f"{self._describe_first_lateness()}")
 
     def _is_affected(self, check: CheckResult) -> bool:
@@ -188,7 +189,7 @@ class Outcome:
                    for check in self.checks)
 
     def _describe_first_lateness(self) -> str:
-        first = min(self.attribution.disturbances, key=lambda found: found.first, default=None)
+        first = min(self.attribution.disturbances, key=lambda each: each.first, default=None)
         if first is None:
             return "the plant's own heartbeat was not on time" if self._is_plant_off else ""
         return f"first t = {self.find_time(first.first):.3f} s: {first.text}"
@@ -204,16 +205,16 @@ class Outcome:
             return ""
         if cause.text == self.aborted and not self.attribution.consequences:
             return self.aborted
-        then = [f"{trouble.text} at {self.find_time(cycle):.3f} s"
-                for cycle, trouble in self.attribution.consequences[:4]]
+        consequences = [f"{trouble.text} at {self.find_time(cycle):.3f} s"
+                        for cycle, trouble in self.attribution.consequences[:4]]
         text = f"t = {self.find_time(cause.cycle):.3f} s: {cause.text}"
-        return f"{text}; then: {', '.join(then)}" if then else text
+        return f"{text}; then: {', '.join(consequences)}" if consequences else text
 
     @property
     def why(self) -> str:
         """The reason of a verdict other than PASS, in words, and the calibrations that do not hold."""
-        passed = sum(check.passed for check in self.checks)
-        words = {"NOT_JUDGED": f"the sequence has no checks; {passed} protocol checks passed",
+        pass_count = sum(check.passed for check in self.checks)
+        words = {"NOT_JUDGED": f"the sequence has no checks; {pass_count} protocol checks passed",
                  "FAIL": "; ".join(self.failures), "INVALID_TIMING": self.timing_problem,
                  "CANNOT_TELL": "too uncertain for a verdict: " + "; ".join(
                      check.name for check in self._list_checks("CANNOT_TELL")),
@@ -228,7 +229,7 @@ class Outcome:
 
     def to_json(self) -> dict[str, Any]:
         """The content of `rig run --json` and verdict.json; null for NaN and infinity."""
-        events, omitted = select_events(self.events)
+        events, omissions = select_events(self.events)
         return {"verdict": self.verdict, "trace": str(self.folder / "trace.mcap"), "why": self.why,
                 "checks": [to_plain(check.collect_data()) for check in self.checks],
                 "not_applicable": [check._asdict() for check in self.skipped],
@@ -241,22 +242,22 @@ class Outcome:
                     "name": NAMES[role], "identity": vars(self.identities[role]),
                     "operational_ms": round(1e3 * self.start_times[role], 1) if role in self.start_times else None}
                     for role in sorted(self.identities)},
-                "events": [to_plain(event._asdict()) for event in events], "events_omitted": omitted,
+                "events": [to_plain(event._asdict()) for event in events], "events_omitted": omissions,
                 "run": self.job.list_settings(), "fdi": self.fdi}
 
     def _attribution_to_json(self) -> dict[str, Any]:
-        found = self.attribution
-        cause = None if found.cause is None else {
-            "source": self._name_source(found.cause), "kind": found.cause.kind, "t": self.find_time(found.cause.cycle),
-            "cycle": found.cause.cycle, "text": found.cause.text, "evidence": list(found.cause.evidence)}
+        attribution, cause = self.attribution, self.attribution.cause
+        cause_data = None if cause is None else {
+            "source": self._name_source(cause), "kind": cause.kind, "t": self.find_time(cause.cycle),
+            "cycle": cause.cycle, "text": cause.text, "evidence": list(cause.evidence)}
         consequences = [{"t": self.find_time(cycle), "source": self._name_node(trouble.node), "kind": trouble.kind,
-                         "text": trouble.text} for cycle, trouble in found.consequences]
-        judged = {"cycles": len(found.judged), "judged": int(found.judged.sum()), "invalid": found.invalid,
-                  "overruns": int(found.overruns.sum()),
-                  "lateness": [{"t": self.find_time(each.first), "cycle": each.first, "last": each.last,
-                                "source": self._name_node(each.source), "text": each.text}
-                               for each in found.disturbances[:100]]}
-        return {"cause": cause, "consequences": consequences[:100], "judged": judged}
+                         "text": trouble.text} for cycle, trouble in attribution.consequences]
+        return {"cause": cause_data, "consequences": consequences[:100], "judged": {
+            "cycles": len(attribution.judged), "judged": int(attribution.judged.sum()), "invalid": attribution.invalid,
+            "overruns": int(attribution.overruns.sum()),
+            "lateness": [{"t": self.find_time(each.first), "cycle": each.first, "last": each.last,
+                          "source": self._name_node(each.source), "text": each.text}
+                         for each in attribution.disturbances[:100]]}}
 
     def _name_source(self, cause: Cause) -> str:
         """Who a cause names: a node, "sequence" for a fault of the sequence, "bench", else the kind of the trouble."""
@@ -271,10 +272,10 @@ class Outcome:
 
     def describe_attribution(self) -> dict[str, str]:
         """First cause and consequences as they stand in the log; evidence and consequences are JSON."""
-        found = self._attribution_to_json()
-        cause = found["cause"]
+        attribution = self._attribution_to_json()
+        cause = attribution["cause"]
         return {"t": f"{cause['t']:.3f}", "source": cause["source"], "text": cause["text"],
-                "evidence": json.dumps(cause["evidence"]), "consequences": json.dumps(found["consequences"])}
+                "evidence": json.dumps(cause["evidence"]), "consequences": json.dumps(attribution["consequences"])}
 
     def save(self) -> None:
         """Write verdict.json."""
@@ -284,12 +285,12 @@ class Outcome:
 def select_events(events: Sequence[Event], most: int = 200) -> tuple[list[Event], dict[str, int]]:
     """The first `most` events of each kind, in order, and how many of each kind are omitted; the log has them all."""
     counts: Counter[str] = Counter()
-    selected = []
+    selection = []
     for event in events:
         counts[event.kind] += 1
         if counts[event.kind] <= most:
-            selected.append(event)
-    return selected, {kind: count - most for kind, count in counts.items() if count > most}
+            selection.append(event)
+    return selection, {kind: count - most for kind, count in counts.items() if count > most}
 
 
 def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str, reason: str = "") -> dict[str, Any]:
@@ -301,8 +302,8 @@ def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str, re
     times = {name: compute_percentiles(history.column(name)) for name in ("execution", "lateness", "response")}
     return {"kind": kind, "reason": reason, "cycles": len(history), "overruns": loop.overruns,
             "underruns": loop.underruns, "scheduler": scheduler,
-            **{f"{name}_us": {key: round(found[key], 1) if found else None for key in PERCENTILES}
-               for name, found in times.items()}}
+            **{f"{name}_us": {key: round(percentiles[key], 1) if percentiles else None for key in PERCENTILES}
+               for name, percentiles in times.items()}}
 
 
 NEAR_A_STOP = 5.0  # standard deviations of the sensor's noise from a stop within which a reading is at it
@@ -317,9 +318,9 @@ def find_limits(column: Callable[[str], Array], model: Model, zero: int) -> tupl
         zero: the cycle in which main starts.
     """
     signals = model.kind.signals
-    ways = [s for s in signals.outputs if s.unit == signals.controlled.unit]
-    period, found = model["controller.period"], []
-    for signal in (*ways, signals.drive):
+    positions = [s for s in signals.outputs if s.unit == signals.controlled.unit]
+    period, limits = model["controller.period"], []
+    for signal in (*positions, signals.drive):
         limit = model.values.get(signal.limit)
         if limit is None:  # the plant declares none
             continue
@@ -327,9 +328,9 @@ def find_limits(column: Callable[[str], Array], model: Model, zero: int) -> tupl
         margin = two_counts if signal.role == "drive" else NEAR_A_STOP * model.values.get(signal.noise, 0.0)
         rows = np.flatnonzero(np.abs(column(signal.name)) >= limit - margin)
         if len(rows):
-            found.append(LimitReached(signal.limit, signal.name, limit, (int(rows[0]) - zero) * period,
-                                      len(rows) * period))
-    return tuple(found)
+            limits.append(LimitReached(signal.limit, signal.name, limit, (int(rows[0]) - zero) * period,
+                                       len(rows) * period))
+    return tuple(limits)
 
 
 FDI_FAILS = ("MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE")  # verdicts of rig fdi that fail a run
@@ -368,8 +369,8 @@ def describe_faults(answer: Mapping[str, Any], *levels: str) -> str:
         return ""
     from fdi.report import list_found_faults
 
-    return "; ".join(f"{found.name} {found.level}, {found.size}" for found in list_found_faults(answer)
-                     if not levels or found.level in levels)
+    return "; ".join(f"{fault.name} {fault.level}, {fault.size}" for fault in list_found_faults(answer)
+                     if not levels or fault.level in levels)
 
 
 def describe_finding(answer: Mapping[str, Any]) -> str:
@@ -436,8 +437,8 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     priority = 1 if loop.kind == "hard" else LOOP_PRIORITY
     with enter_real_time(priority) if job.realtime else contextlib.nullcontext():
         session.run_phases()
-        scheduled = loop.scheduler or name_scheduler()
-    spent = stopwatch.now() * 1e-9
+        scheduler = loop.scheduler or name_scheduler()
+    seconds = stopwatch.now() * 1e-9
     kind = f"{loop.kind} real time" if job.realtime else "lockstep"
     reason = (f"the cycles run in Python, because compiled code cannot use the bus {job.bus}"
               if kind == "soft real time" else "")
@@ -448,21 +449,21 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     started_ns = read_epoch_ns()
     metrology = collect_metrology(job.bench, job.model.kind.signals, job.sequence.decision, started_ns)
     progress("checks", 0.0)
-    checks, skipped = judge_run(job, session, attribution.judged, metrology)
+    checks, skipped_checks = judge_run(job, session, attribution.judged, metrology)
     for check in checks:
         recorder.put(session.stage.now(), check)
     diagnosis = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.safety.interrupted else {}
     safety, starter = session.safety, session.starter
     outcome = Outcome(
-        job=job, folder=folder, checks=checks, skipped=skipped, events=session.journal.events, aborted=safety.aborted,
-        safe=safety.is_safe, interrupted=safety.interrupted, fdi=diagnosis, attribution=attribution,
-        timing=summarise_timing(history, loop, scheduled, kind, reason), counters=_count_lost_frames(history),
-        speed=len(history) * job.period_ns * 1e-9 / spent, start_times=starter.start_times,
-        identities=starter.identities, metrology=metrology, started_ns=started_ns,
+        job=job, folder=folder, checks=checks, skipped=skipped_checks, events=session.journal.events,
+        aborted=safety.aborted, safe=safety.is_safe, interrupted=safety.interrupted, fdi=diagnosis,
+        attribution=attribution, timing=summarise_timing(history, loop, scheduler, kind, reason),
+        counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / seconds,
+        start_times=starter.start_times, identities=starter.identities, metrology=metrology, started_ns=started_ns,
         limits=find_limits(history.column, job.model, job.scenario.plan.start))
     fdi, cause = outcome.fdi, attribution.cause
     notes: dict[str, dict[str, str]] = {
-        "not_applicable": {check.name: check.reason for check in skipped},
+        "not_applicable": {check.name: check.reason for check in skipped_checks},
         "differences": {"text": find_differences(job)["text"]},
         "metrology": {"decision": metrology.decision, **{
             name: each.describe() for name, each in metrology.calibration.items()}} if metrology.is_used else {},
@@ -479,7 +480,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     return outcome
 
 
-def judge_run(job: Job, session: Session, judged: Mask,
+def judge_run(job: Job, session: Session, is_judged: Mask,
               metrology: Metrology = NO_METROLOGY) -> tuple[list[CheckResult], list[SkippedCheck]]:
     """Judge the main phase by the checks of the sequence, and the whole run by the protocol checks.
 
@@ -489,13 +490,14 @@ def judge_run(job: Job, session: Session, judged: Mask,
     main = [session.log.history.column(name, MAIN) for name in kind.signals.names]
     t = np.arange(len(main[0]), dtype=np.float64) * (job.period_ns * 1e-9)
     sequence = job.sequence
-    unsaid = {check.name: skipped for check in sequence.checks if (skipped := find_skipped(check, job.bench))}
-    results = evaluate_checks([check for check in sequence.checks if check.name not in unsaid],
+    skipped_checks = {check.name: skipped_check for check in sequence.checks
+                      if (skipped_check := find_skipped(check, job.bench))}
+    results = evaluate_checks([check for check in sequence.checks if check.name not in skipped_checks],
                               make_columns_type(kind.signals)(t, *main),
                               sequence.sections(), session.journal.events, sequence.fault_starts(),
                               session.log.read_drives(), sequence.rate, kind.signals, metrology=metrology)
-    protocol, inapplicable = judge_protocol(session.read_protocol_record(judged), sequence.protocol)
-    return [*results, *protocol], [*unsaid.values(), *inapplicable]
+    protocol, inapplicable = judge_protocol(session.read_protocol_record(is_judged), sequence.protocol)
+    return [*results, *protocol], [*skipped_checks.values(), *inapplicable]
 
 
 def make_main_trace(job: Job, folder: Path, history: History) -> Trace:
@@ -526,8 +528,8 @@ def select_plant_delays(record: CycleRecord | None, cycles: int) -> Array:
     """From SYNC to feedback by the plant's own record, s, (cycles,); 0 where it has no entry."""
     delays = np.zeros(cycles)
     if record is not None:
-        known = (record.cycle >= 0) & (record.cycle < cycles)
-        delays[record.cycle[known]] = (record.sent - record.sync)[known] * 1e-9
+        is_in_run = (record.cycle >= 0) & (record.cycle < cycles)
+        delays[record.cycle[is_in_run]] = (record.sent - record.sync)[is_in_run] * 1e-9
     return delays
 
 

@@ -114,8 +114,8 @@ class CycleLog:
         for row in rows:
             values = dict(zip(self._signals.names, self._read_row(row), strict=True))
             error = values[self._signals.command.name] - values[self._signals.controlled.name]
-            if passed := self._guards.find_passed({"error": error, **values}):
-                return passed
+            if guard := self._guards.find_passed({"error": error, **values}):
+                return guard
         return None
 
 
@@ -247,7 +247,7 @@ class Session:
         self.journal.announce("INFO", "phase", PHASES[phase])
         for section in profile.sections:
             self.journal.announce("INFO", "section", f"{PHASES[phase]}: {section.name}")
-            shown = section.name if phase == MAIN else PHASES[phase]
+            label = section.name if phase == MAIN else PHASES[phase]
             i = section.start
             while i < section.stop:
                 self._announce_faults()
@@ -261,7 +261,7 @@ class Session:
                     i += 1
                 self._demand = float(profile.command[i - 1])
                 if loop.queued // 50 > before // 50:
-                    self._progress(shown, loop.k / max(self.scenario.plan.stop, loop.k))
+                    self._progress(label, loop.k / max(self.scenario.plan.stop, loop.k))
                 if self.nodes.note_ended_processes() if phase == CLEANUP else self._must_end():
                     return False
         return True
@@ -271,9 +271,9 @@ class Session:
         if self.safety.is_safe or not self._powered:
             return 0
         demands, k = demands[:MOST], self.stage.playing.queued
-        loads, known = np.zeros(len(demands)), self._loads[k:k + len(demands)]
+        loads, scenario_loads = np.zeros(len(demands)), self._loads[k:k + len(demands)]
         if phase == MAIN:
-            loads[:len(known)] = known
+            loads[:len(scenario_loads)] = scenario_loads
         return self.stage.playing.play_many(phase, demands, loads, control)
 
     def _must_end(self) -> bool:
@@ -285,8 +285,8 @@ class Session:
             self.safety.abort("overrun", self._overruns.problem)
         if self._stop() and not self.safety.aborted:
             self.safety.stop()
-        if passed := self.log.find_passed_guard():
-            why = f"guard {passed.name!r} was passed by {passed.signal}"
+        if guard := self.log.find_passed_guard():
+            why = f"guard {guard.name!r} was passed by {guard.signal}"
             self.safety.note("guard", why)
             self.safety.abort("guard", why)
         return bool(self.safety.aborted)
@@ -322,8 +322,8 @@ class Session:
         if self.job.bench.profile == "none" and not self.job.bench.is_enabled(PHASES[phase]):
             return words.ladder[State.READY]
         # without set-up main is where it is enabled; one cycle each on the way to ACTIVE where nothing is confirmed
-        started = State.ACTIVE if words.is_confirmed else self.stage.playing.queued + 1
-        return words.ladder[min(started, State.ACTIVE)]
+        state = State.ACTIVE if words.is_confirmed else self.stage.playing.queued + 1
+        return words.ladder[min(state, State.ACTIVE)]
 
     def _discard_queue(self) -> None:
         """Discard the cycles that are queued, and their events; clean-up begins with the demand of the last one."""
@@ -366,13 +366,13 @@ class Session:
             for each in list_inputs(step, self._demand):
                 self.stage.playing.cycle(each)
 
-    def read_protocol_record(self, judged: Mask) -> ProtocolRecord:
-        """All that the protocol checks of this run are judged by; `judged`: cycles in which the bench was on time."""
-        job, model, start = self.job, self.job.model, self.starter
+    def read_protocol_record(self, is_judged: Mask) -> ProtocolRecord:
+        """All that the protocol checks of this run are judged by; `is_judged`: cycles with the bench on time."""
+        job, model, starter = self.job, self.job.model, self.starter
         cycles = sum(step.cycles for step in list_first_steps(job.sequence.protocol, job.bench))
 
         def read(history: History) -> Rows:
-            rows = read_rows(history, start.find_on_time_of(history))
+            rows = read_rows(history, starter.find_on_time_of(history))
             if job.realtime:  # without feedback there is nothing to answer to
                 return rows._replace(drive=np.where(np.isnan(rows.position), np.nan, rows.drive))
             return rows
@@ -380,8 +380,8 @@ class Session:
         history, after = self.log.history, self.log.after
         return ProtocolRecord(
             enabling=[(cycle, each.rows) for cycle, each in self._enablings],
-            run=read_rows(history, judged & start.find_on_time_of(history, self.faults)),
-            probes=[Rows._make(column[-cycles:] for column in read(probe)) for probe in start.probes if len(probe)],
+            run=read_rows(history, is_judged & starter.find_on_time_of(history, self.faults)),
+            probes=[Rows._make(column[-cycles:] for column in read(probe)) for probe in starter.probes if len(probe)],
             after=read(after) if len(after) else None, emergencies=self.nodes.emergencies,
             heartbeats={NAMES[node]: times for node, times in self.nodes.heartbeats.items()},
             heard=(self.stage.begun_ns * 1e-9, self.stage.clock.now() * 1e-9),
@@ -389,8 +389,8 @@ class Session:
             unsound=self.stage.playing.unsound if not job.sequence.disturbs_bus else 0,
             deaf_cycles=self.faults.list_frame_hits("rig")[:, 0].tolist(), heartbeat_period=HEARTBEAT * 1e-3,
             bench=job.bench,
-            drive_limit=model.values.get(model.kind.signals.drive.limit, np.nan) if start.gains is None
-            else start.gains.current_limit,
+            drive_limit=model.values.get(model.kind.signals.drive.limit, np.nan) if starter.gains is None
+            else starter.gains.current_limit,
             still_limit=50.0 * job.bench.fineness if model.kind.control is control_by_pid else np.nan,
-            gains=None if find_firmware_parameters(model) else start.gains, realtime=job.realtime,
+            gains=None if find_firmware_parameters(model) else starter.gains, realtime=job.realtime,
             is_response_judged=job.realtime and not self._is_embedded)

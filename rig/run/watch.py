@@ -100,8 +100,8 @@ class NodeWatch:
             is_in_run = self._stage.loop is not None and self._stage.is_playing
             self.emergencies.append(Emergency(self._stage.playing.k if is_in_run else -1, node, error.code))
         if error.code & 0xFF00 == 0:
-            left = "an error is gone, others stand" if error.register else "no error any more"
-            self._journal.log("INFO", "recovered", f"{self._bench.describe_node(node)}: {left}")
+            message = "an error is gone, others stand" if error.register else "no error any more"
+            self._journal.log("INFO", "recovered", f"{self._bench.describe_node(node)}: {message}")
         elif error.code == EmcyCode.HEARTBEAT_LOST and self._master.is_behind():
             self._safety.handle("late", f"the rig sent no heartbeat for {self._master.pause:.2f} s, and "
                                         f"{self._bench.describe_node(node)} reports 0x{error.code:04X}", RIG)
@@ -168,17 +168,17 @@ class NodeWatch:
         """
         if self._master.is_deaf:
             return
-        heard = self._master.heard_ns  # after a reset a node may have no heartbeat, and answers no SYNC
+        heard_ns = self._master.heard_ns  # after a reset a node may have no heartbeat, and answers no SYNC
         answering = [node for node, cycle in self.last_answers.items() if cycle == self._last_row]
-        found = self._silence.find_silent(now, {node: heard[node] for node, state in self._master.states.items()
-                                                if node in heard and state == NmtState.OPERATIONAL}, answering)
-        for node in self._silent - found.keys():
+        silences = self._silence.find_silent(now, {node: heard_ns[node] for node, state in self._master.states.items()
+                                                   if node in heard_ns and state == NmtState.OPERATIONAL}, answering)
+        for node in self._silent - silences.keys():
             self._silent.discard(node)
             self._handle_return(node)
-        for node in found.keys() - self.gone.keys():
+        for node in silences.keys() - self.gone.keys():
             self._silent.add(node)
-            self.gone[node] = f"no heartbeat for {found[node]:.1f} s either"
-            what = f"{self._bench.describe_node(node)}: no heartbeat for {found[node]:.1f} s, and no answer"
+            self.gone[node] = f"no heartbeat for {silences[node]:.1f} s either"
+            what = f"{self._bench.describe_node(node)}: no heartbeat for {silences[node]:.1f} s, and no answer"
             self._safety.handle("heartbeat", what, node)
             if not self._safety.aborted:  # no sequence can mean that in lockstep
                 self._safety.abort("abort", what)
@@ -255,10 +255,10 @@ class SilenceWatch:
             heard_ns: when the last heartbeat of each node came that is to be watched.
             answering: nodes that take part in the cycles.
         """
-        passed = min(now_ns - self._looked_ns, self._step)
+        elapsed_ns = min(now_ns - self._looked_ns, self._step)
         self._looked_ns = now_ns
-        self._silent_ns = {node: self._silent_ns.get(node, 0) + passed if heard == self._heard_ns.get(node) else 0
-                           for node, heard in heard_ns.items()}
+        self._silent_ns = {node: self._silent_ns.get(node, 0) + elapsed_ns if t_ns == self._heard_ns.get(node) else 0
+                           for node, t_ns in heard_ns.items()}
         self._heard_ns = dict(heard_ns)
-        return {node: silent * 1e-9 for node, silent in self._silent_ns.items()
-                if silent >= self._limit and node not in answering}
+        return {node: silence_ns * 1e-9 for node, silence_ns in self._silent_ns.items()
+                if silence_ns >= self._limit and node not in answering}
