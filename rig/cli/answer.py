@@ -191,16 +191,16 @@ def _show_bar(stage: str, delay: float = 2.0) -> Iterator[Progress]:
 
 @contextlib.contextmanager
 def _show_line() -> Iterator[Progress]:
-    shown = ("", -1)
+    last_state = ("", -1)
 
     def update(stage: str, share: float) -> None:
-        nonlocal shown
-        now = (stage, int(20 * share))  # each write may cost the loop some microseconds: only every 5 %
-        if now != shown:
-            shown = now
+        nonlocal last_state
+        state = (stage, int(20 * share))  # each write may cost the loop some microseconds: only every 5 %
+        if state != last_state:
+            last_state = state
             print(f"\r\033[K{stage:<14} {100 * share:3.0f} %", end="", file=sys.stderr, flush=True)
 
     try:
         yield update
     finally:  # the headline begins a line, also in a capture
-        print("\r\033[K", end="\n" if shown[0] else "", file=sys.stderr, flush=True)
+        print("\r\033[K", end="\n" if last_state[0] else "", file=sys.stderr, flush=True)

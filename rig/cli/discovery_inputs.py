@@ -21,21 +21,22 @@ def load_known_model(args: argparse.Namespace) -> tuple[Model, Provenance]:
     """
     load_chosen_effects(args)
     is_file = args.model and Path(args.model).suffix != ".py" and Path(args.model).is_file()
-    model, known = load_model_file(Path(args.model)) if is_file else (load_model(args.model or "eha"), Provenance())
-    files = tuple(dict.fromkeys([*known.effect_files, *map(str, args.effects)]))
-    return change_model(model, args), replace(known, effect_files=files)
+    model, provenance = (load_model_file(Path(args.model)) if is_file else
+                         (load_model(args.model or "eha"), Provenance()))
+    files = tuple(dict.fromkeys([*provenance.effect_files, *map(str, args.effects)]))
+    return change_model(model, args), replace(provenance, effect_files=files)
 
 
 def split_words(words: Sequence[str], plant: str, trace: str | None = None) -> tuple[list[str], str | None]:
-    """The effects of a plant among the words of a command, and the trace: one of them if none is known.
+    """The effects of a plant among the words of a command, and the trace: one of them if `trace` is None.
 
     Raises:
         InputError: a word that is neither an effect nor a trace; it offers the nearest effect.
     """
-    effects, known = [], [e.name for e in find_plant(plant).list_effects()]
+    effects, names = [], [e.name for e in find_plant(plant).list_effects()]
     for word in words:
         is_file = word.endswith((".csv", ".csv.gz", ".mcap")) or Path(word).exists()
-        if trace is None and is_file and word not in known:
+        if trace is None and is_file and word not in names:
             trace = word
         else:
             effects.append(find_effect(word, plant).name)
@@ -49,9 +50,9 @@ def choose_model_file(args: argparse.Namespace, trace: str | None) -> Path:
     Raises:
         InputError: a place that cannot be written, or another kind of file.
     """
-    named = Path(args.model or "")
-    own = args.model if named.suffix == ".toml" and named.is_file() else "model.toml"
-    path = choose_file(args.out or own, (".toml",), trace)
+    model_file = Path(args.model or "")
+    default = args.model if model_file.suffix == ".toml" and model_file.is_file() else "model.toml"
+    path = choose_file(args.out or default, (".toml",), trace)
     assert path is not None
     return path
 

@@ -53,8 +53,8 @@ def load_chosen_effects(args: argparse.Namespace) -> None:
 
 def find_log(args: argparse.Namespace) -> Path | None:
     """The first log among the arguments."""
-    given = [getattr(args, "trace", None), *(getattr(args, name, None) or [] for name in ("runs", "words"))]
-    names = [name for each in given if each for name in ([each] if isinstance(each, str | Path) else each)]
+    arguments = [getattr(args, "trace", None), *(getattr(args, name, None) or [] for name in ("runs", "words"))]
+    names = [name for each in arguments if each for name in ([each] if isinstance(each, str | Path) else each)]
     return next((path for path in map(Path, names) if path.suffix == ".mcap" or (path / "trace.mcap").is_file()), None)
 
 
@@ -116,9 +116,9 @@ def list_signals(args: argparse.Namespace) -> list[str] | None:
 
 def format_arguments(args: argparse.Namespace) -> str:
     """The runs and the model of a command, as arguments of the command to type next."""
-    given = {name: getattr(args, name, None) or []
-             for name in ("repeat", "holdout", "model", "set", "effects", "signals", "faults")}
-    words = [word for name, values in given.items() for value in (values if isinstance(values, list) else [values])
+    options = {name: getattr(args, name, None) or []
+               for name in ("repeat", "holdout", "model", "set", "effects", "signals", "faults")}
+    words = [word for name, values in options.items() for value in (values if isinstance(values, list) else [values])
              for word in (f"--{name}", str(value))]
     return shlex.join([args.trace, *words, *(["--trust"] if args.trust else [])])
 

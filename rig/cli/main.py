@@ -50,17 +50,17 @@ class _PrintVersion(argparse.Action):
         parser.exit()
 
 
-def build_parser(chosen: str = "") -> argparse.ArgumentParser:
-    """Build the parser of `rig` with all commands; only the chosen command has its options."""
+def build_parser(command_name: str = "") -> argparse.ArgumentParser:
+    """Build the parser of `rig` with all commands; only the command of this name has its options."""
     parser = _Parser(prog="rig", description="Hardware-in-the-loop rig for an electrohydraulic actuator.",
                      epilog="For the options of a command: rig COMMAND --help. Exit status: 0 passed, 1 not passed, "
                             "2 bad input, 3 timing invalid, 70 internal error, 130 interrupted.")
     parser.add_argument("--version", action=_PrintVersion, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
-        added = commands.add_parser(name, help=command.help)
-        if name == chosen:
-            add_options(added, (*command.options, *OF_EVERY_COMMAND))
+        command_parser = commands.add_parser(name, help=command.help)
+        if name == command_name:
+            add_options(command_parser, (*command.options, *OF_EVERY_COMMAND))
     return parser
 
 
@@ -84,12 +84,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     leave_out_reader(sys.argv[1:])
     keep_memory()
     repeat_lost_interrupts()
-    known: list[int] = []
-    atexit.register(leave_quickly, known)
-    known.append(run_command_line(sys.argv[1:]))
-    if known == [INTERRUPTED] and _are_fits_at_work():
-        leave_quickly(known)  # Python would wait for the threads
-    return known[0]
+    statuses: list[int] = []
+    atexit.register(leave_quickly, statuses)
+    statuses.append(run_command_line(sys.argv[1:]))
+    if statuses == [INTERRUPTED] and _are_fits_at_work():
+        leave_quickly(statuses)  # Python would wait for the threads
+    return statuses[0]
 
 
 def _are_fits_at_work() -> bool:
@@ -117,17 +117,17 @@ def keep_memory() -> None:
             choose(option, value)
 
 
-def leave_quickly(known: Sequence[int]) -> None:
+def leave_quickly(statuses: Sequence[int]) -> None:
     """End the program without taking its modules apart, which takes up to a second with compiled code in memory.
 
     Args:
-        known: the exit status. Nothing: an exception or sys.exit ends the program, and Python finds the status.
+        statuses: the exit status. Empty: an exception or sys.exit ends the program, and Python finds the status.
     """
-    if known:
+    if statuses:
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or none
                 stream.flush()
-        os._exit(known[0])
+        os._exit(statuses[0])
 
 
 def run_command_line(words: Sequence[str]) -> int:
@@ -158,9 +158,9 @@ def run_command_line(words: Sequence[str]) -> int:
 
         from plant import find_compile_error
 
-        told = find_compile_error(error)  # a function of a user's plant file is compiled where it is first needed
-        if told is not None:
-            return _report_error(name, str(told), told.status)
+        compile_error = find_compile_error(error)  # a user's plant file is compiled where it is first needed
+        if compile_error is not None:
+            return _report_error(name, str(compile_error), compile_error.status)
         print_exc()  # an internal error; Python's own exit status 1 would read as a failed check
         return INTERNAL
 

@@ -38,11 +38,11 @@ def run_suite(args: argparse.Namespace) -> int:
     """
     args.sequence = args.sequence or ["preflight"]
     base = build_choice(args)._replace(bus=choose_bus_of_run(args, args.bus, args.controller)[0])
-    tried = read_suite(args, base)
-    processes = choose_processes(args, base, len(tried.cases))
+    suite = read_suite(args, base)
+    processes = choose_processes(args, base, len(suite.cases))
     name = Path(args.sequence[0]).stem if len(args.sequence) == 1 else "suite"
     folder = Path(args.out) if args.out else make_new_folder(Path("runs"), name)  # not before all has been tried
-    suite = tried._replace(cases=[case._replace(folder=folder / case.folder) for case in tried.cases])
+    suite = suite._replace(cases=[case._replace(folder=folder / case.folder) for case in suite.cases])
     for path in (folder, *(case.folder for case in suite.cases)):
         make_folder(path)
     junit = choose_file(args.junit, (".xml",), None, "--junit")
@@ -73,13 +73,13 @@ def read_suite(args: argparse.Namespace, base: JobChoice) -> Suite:
             continue
         require(not (args.model or args.set or args.seed is not None), "--model, --set, --seed", "",
                 f"in the suite file {name}, as keys of its cases")
-        content, own = read_suite_file(Path(name), base, is_trusted=args.trust)
-        cases += own
+        content, suite_cases = read_suite_file(Path(name), base, is_trusted=args.trust)
+        cases += suite_cases
         titles[name] = content.title
-        listed = content.requirements
-        files += [Path(name).parent / listed] if isinstance(listed, str) else []
-        if not isinstance(listed, str):
-            requirements |= dict.fromkeys(listed, "") if isinstance(listed, tuple) else dict(listed)
+        entry = content.requirements  # a file, ids, or texts by id
+        files += [Path(name).parent / entry] if isinstance(entry, str) else []
+        if not isinstance(entry, str):
+            requirements |= dict.fromkeys(entry, "") if isinstance(entry, tuple) else dict(entry)
     for file in files:
         requirements |= read_requirements(file)
     title = next(iter(titles.values())) if len(titles) == 1 else count_nouns(len(args.sequence), "sequence")
@@ -105,12 +105,12 @@ def announce_suite(suite: Suite, processes: int, *, is_silent: bool) -> Callable
     """Say what is about to run; the function returned prints a line for each case that has ended."""
     if is_silent:
         return lambda _: None
-    console, ended, cases = open_console(), 0, len(suite.cases)
+    console, number, cases = open_console(), 0, len(suite.cases)
 
     def show(result: CaseResult) -> None:
-        nonlocal ended
-        ended += 1
-        line = Text(describe_result(result, ended, cases))
+        nonlocal number
+        number += 1
+        line = Text(describe_result(result, number, cases))
         line.stylize(style_of(Cell("", MOODS[result.verdict])), 0, len(result.verdict))
         console.print(line, soft_wrap=True)
 

@@ -19,12 +19,12 @@ from rig.cli import (
 
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if the effects help."""
-    model, known = load_known_model(args)
+    model, provenance = load_known_model(args)
     effects, trace = split_words(args.words, model.plant)
     path = choose_model_file(args, trace)
     page = choose_file(str(path.with_suffix(".html")), (".html",), trace)
     with show_progress(args, "reading") as progress:
-        runs = find_runs(model, known, trace, args.repeat, args.holdout, list_signals(args))
-        update = add_effects(effects, runs, model, known, format_command_line(), progress)
+        runs = find_runs(model, provenance, trace, args.repeat, args.holdout, list_signals(args))
+        update = add_effects(effects, runs, model, provenance, format_command_line(), progress)
     report = build_model_report(update, path, write_model_file(update, path), page)
     return give_answer(report, args, int(not update.helps), Places(page))

@@ -25,10 +25,10 @@ REALTIME: Mapping[str, Any] = {"bus": "auto", "seconds": 60.0, "blocks": 6}  # o
 def run_command(args: argparse.Namespace) -> int:
     """Exit status 1 if a target of the cycle in real time that could be measured is not met."""
     is_realtime = args.what == "realtime"
-    given = {name: value for name, value in vars(args).items() if name in REALTIME and value is not None}
-    require(is_realtime or not given, f"--{next(iter(given), '')}", "", "rig bench realtime")
+    options = {name: value for name, value in vars(args).items() if name in REALTIME and value is not None}
+    require(is_realtime or not options, f"--{next(iter(options), '')}", "", "rig bench realtime")
     with show_progress(args, is_realtime=is_realtime) as progress:
-        report = measure_cycle({**REALTIME, **given}, progress) if is_realtime else measure_plant(args, progress)
+        report = measure_cycle({**REALTIME, **options}, progress) if is_realtime else measure_plant(args, progress)
     is_missed = any(not each["is_met"] for each in report.data.get("targets", ()) if each["value"] is not None)
     return give_answer(report, args, int(is_missed), Places(answer=Path(args.out) if args.out else None))
 

@@ -40,11 +40,11 @@ def run_command(args: argparse.Namespace) -> int:
     if args.summary:
         folder = Path(args.out or args.what or "")
         return give_summary(read_campaign_rows(folder), folder, args)
-    chosen, folder = choose_matrix(args)
+    matrix, folder = choose_matrix(args)
     workers = Workers(args.jobs or len(os.sched_getaffinity(0)), args.scheduler or "")
     try:
         with show_batch_progress(args) as report_progress:
-            rows = run_campaign(chosen, folder, workers, report_progress, args.most, args.again)
+            rows = run_campaign(matrix, folder, workers, report_progress, args.most, args.again)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted; rig campaign {shlex.quote(str(folder))} resumes it") from None
     return give_summary(rows, folder, args)
@@ -60,8 +60,8 @@ def give_summary(rows: Sequence[Row], folder: Path, args: argparse.Namespace) ->
         write_statistics(figures, folder)
         names = sorted(file.name for file in folder.iterdir() if file.suffix in (".parquet", ".json", ".svg"))
         report = replace(report, files=[("results", f"{folder}/ {', '.join(names)}")])
-        if left := len(read_matrix_of_folder(folder).cases) - len(rows):
-            report = replace(report, sentence=f"{report.sentence} {count_nouns(left, 'case')} left.",
+        if open_cases := len(read_matrix_of_folder(folder).cases) - len(rows):
+            report = replace(report, sentence=f"{report.sentence} {count_nouns(open_cases, 'case')} left.",
                              next_command=f"rig campaign {shlex.quote(str(folder))}")
     is_missed = any(rate["met"] is False for part in figures["tolerances"] for rate in part["rates"])
     return give_answer(report, args, int(is_missed or bool(figures["status"].get("failed"))))
@@ -83,32 +83,32 @@ def choose_matrix(args: argparse.Namespace) -> tuple[Matrix, Path]:
     Raises:
         InputError: options that do not belong together, or a matrix that cannot be used.
     """
-    wanted = {"seeds": args.seeds, "first": args.seed, "simulator": args.simulator, "signals": args.signals,
-              "tolerance": None if args.tolerance is None else _parse_numbers(args.tolerance)}
-    changed = {key: value for key, value in wanted.items() if value is not None}
+    options = {"seeds": args.seeds, "first": args.seed, "simulator": args.simulator, "signals": args.signals,
+               "tolerance": None if args.tolerance is None else _parse_numbers(args.tolerance)}
+    changes = {key: value for key, value in options.items() if value is not None}
     work = WORKS.get(args.work, args.work)
     if args.what and is_campaign_folder(args.what):
-        require(not (changed or args.fault or args.faults or args.model or args.set or args.out), args.what, "",
+        require(not (changes or args.fault or args.faults or args.model or args.set or args.out), args.what, "",
                 "no other option about the matrix: this folder has its own")
-        found = read_matrix_of_folder(args.what)
-        require(found.spec["work"] in (*WORKS.values(), work), args.what, "work",  # a folder is data
-                f"--work {found.spec['work']} on the command line, to call that function")
-        if "plant_file" in found.spec:
-            path = Path(found.spec["plant_file"])
+        matrix = read_matrix_of_folder(args.what)
+        require(matrix.spec["work"] in (*WORKS.values(), work), args.what, "work",  # a folder is data
+                f"--work {matrix.spec['work']} on the command line, to call that function")
+        if "plant_file" in matrix.spec:
+            path = Path(matrix.spec["plant_file"])
             code = [ForeignCode(str(path), path.read_bytes())] if path.is_file() else []
             require_trust(args.what, code, is_trusted=args.trust)
-        return found, Path(args.what)
+        return matrix, Path(args.what)
     load_plant_of_model(args.model, is_trusted=args.trust)
     model = load_model(args.model or "eha").replace(parse_changes(args.set))
     faults = choose_faults(args.faults, model.kind)
     campaigns = Path("campaigns")
     if args.what and Path(args.what).is_dir():
-        require(not (changed or args.fault), args.what, "", "no faults or seeds: these are recorded traces")
+        require(not (changes or args.fault), args.what, "", "no faults or seeds: these are recorded traces")
         return (build_trace_matrix(args.what, model, work, faults),
                 Path(args.out or campaigns / Path(args.what).absolute().name))
     tables = read_matrix(args.what) if args.what else {}
-    listed, more = tables.get("case", []), parse_faults(args.fault)
-    tables = {**tables, **changed, "case": [*listed, *more] if isinstance(listed, list) else listed}
+    cases, more = tables.get("case", []), parse_faults(args.fault)
+    tables = {**tables, **changes, "case": [*cases, *more] if isinstance(cases, list) else cases}
     require(args.what or tables["case"], "MATRIX.toml|FOLDER", "",
             f"a matrix file, the shipped matrix {' or '.join(list_shipped_matrices())}, a folder of traces, or --fault "
             "EFFECT=SIZE,..")

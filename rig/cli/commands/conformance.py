@@ -53,11 +53,11 @@ def find_node_of_bench(args: argparse.Namespace) -> tuple[str, Path]:
     """
     bench = load_bench(args.bench, is_trusted=args.trust)
     nodes = {role.name.lower(): node for role, node in bench.nodes.items()}
-    found = nodes.get(args.node or "controller")
-    if found is None or args.eds is not None:
+    node = nodes.get(args.node or "controller")
+    if node is None or args.eds is not None:
         raise InputError("--bench", args.bench,
                          f"one of its CANopen nodes ({', '.join(nodes) or 'it has none'}), and no --eds")
-    return str(found.node), found.eds
+    return str(node.node), node.eds
 
 
 def parse_node(text: str) -> int:

@@ -15,9 +15,10 @@ def run_command(args: argparse.Namespace) -> int:
     """Exit status 0 if noise explains all differences and no check changed, 1 otherwise."""
     places = choose_places(args, "diff.html", args.others[0])
     with show_progress(args) as progress:
-        found = read_and_compare_runs([args.trace, *args.others], load_declared_model(args).kind.signals, progress)
-        report = build_diff_report(found, places.files)
-    return give_answer(report, args, int(found.verdict != "SAME"), places)
+        differences = read_and_compare_runs([args.trace, *args.others], load_declared_model(args).kind.signals,
+                                            progress)
+        report = build_diff_report(differences, places.files)
+    return give_answer(report, args, int(differences.verdict != "SAME"), places)
 
 
 def read_and_compare_runs(sources: Sequence[str], signals: Signals, progress: Progress) -> RunDifferences:

@@ -30,8 +30,8 @@ def run_command(args: argparse.Namespace) -> int:
 
 def build_listening_report(bench: Bench, spec: str, seconds: float) -> Report:
     """Report on the frames of a bench that are heard on a bus."""
-    heard, others = doctor.count_frames(bench, doctor.listen(bench, spec, seconds))
-    findings = list(doctor.judge_frames(bench, heard, others, seconds))
+    counts, others = doctor.count_frames(bench, doctor.listen(bench, spec, seconds))
+    findings = list(doctor.judge_frames(bench, counts, others, seconds))
     is_there = any(each.status == "ok" for each in findings if each.purpose.startswith("controller"))
     sentence = f"The controller is on {spec}." if is_there else f"Nothing of the controller is heard on {spec}."
     return build_report(bench.name, findings, sentence, is_good=is_there)
@@ -61,8 +61,8 @@ def build_report(title: str, findings: Sequence[doctor.Finding], sentence: str, 
 def tabulate_findings(findings: Sequence[doctor.Finding]) -> Table:
     """A row for each finding, below the name of its area."""
     rows: list[list[Cell | str]] = []
-    for area, found in groupby(findings, lambda finding: finding.area):
+    for area, group in groupby(findings, lambda finding: finding.area):
         rows.append([Cell(area, is_strong=True), "", "", "", ""])
         rows += [[f"  {each.name}", Cell(each.status, MOODS[each.status]), each.found, each.purpose, each.remedy]
-                 for each in found]
+                 for each in group]
     return Table([Column(title) for title in ("capability", "", "found", "used for", "how to get it")], rows)

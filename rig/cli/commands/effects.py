@@ -20,11 +20,11 @@ def run_command(args: argparse.Namespace) -> int:
         load_plant(Path(args.model))
     load_user_effects(args.effects)
     plant = load_model(args.model).plant
-    chosen = [find_effect(args.name, plant)] if args.name else find_plant(plant).list_effects()
-    is_own = args.name and chosen[0].file in {file.absolute() for file in args.effects}
+    effects = [find_effect(args.name, plant)] if args.name else find_plant(plant).list_effects()
+    is_own = args.name and effects[0].file in {file.absolute() for file in args.effects}
     with show_progress(args, "testing"):
-        tests = {e.name: test_effect(e, plant) for e in chosen if args.test or is_own}
-    report = build_effects_report(chosen, plant, tests, is_detailed=bool(args.name))
+        tests = {e.name: test_effect(e, plant) for e in effects if args.test or is_own}
+    report = build_effects_report(effects, plant, tests, is_detailed=bool(args.name))
     status = int(any(test.faults for test in tests.values()))
     return give_answer(report, args, status, Places(answer=Path(args.out) if args.out else None))
 
@@ -37,10 +37,10 @@ def test_effect(e: Effect, plant: str = "eha") -> SelfTest:
     return check_effect(e.name, load_nominal_test(kind, kind.nominal["controller.period"])[0], plant=plant)
 
 
-def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[str, SelfTest], *,
+def build_effects_report(effects: Sequence[Effect], plant: str, tests: Mapping[str, SelfTest], *,
                          is_detailed: bool) -> Report:
     """Report on the catalogue, or on one effect in detail, with the self-tests that were made."""
-    rows = [describe_effect(e, plant) for e in chosen]
+    rows = [describe_effect(e, plant) for e in effects]
     for name, test in tests.items():
         row = next(row for row in rows if row["effect"] == name)
         row["self_test"] = {"faults": list(test.faults), "visible": test.visible,
@@ -48,9 +48,9 @@ def build_effects_report(chosen: Sequence[Effect], plant: str, tests: Mapping[st
                                       for shown in test.shown]}
     title, sentence = "effects", ""
     if is_detailed:
-        law = ((chosen[0].function.__doc__ if chosen[0].function else "") or "").partition("\n")[0]
-        title, sentence = chosen[0].name, ": ".join(filter(None, (chosen[0].name, law)))
-    first = _list_properties(chosen[0], rows[0], plant) if is_detailed else _tabulate_effects(chosen, rows)
+        law = ((effects[0].function.__doc__ if effects[0].function else "") or "").partition("\n")[0]
+        title, sentence = effects[0].name, ": ".join(filter(None, (effects[0].name, law)))
+    first = _list_properties(effects[0], rows[0], plant) if is_detailed else _tabulate_effects(effects, rows)
     sections = [Section("", first),
                 *(Section(f"self-test of {name}", [*_show_test(test, plant)]) for name, test in tests.items())]
     return Report("effects", title, sentence=sentence, sections=sections, data={"effects": rows})
@@ -69,16 +69,16 @@ def describe_effect(e: Effect, plant: str = "eha") -> dict[str, Any]:
 
 def _name_signals(text: str, plant: str) -> str:
     """A text of the catalogue, which has the symbols of the EHA, with those of the plant."""
-    own = find_plant(plant).signals
-    symbols = {"Com": own.command.symbol, "XJ": own.controlled.symbol, "Cor": own.drive.symbol}
-    return re.sub("|".join(symbols), lambda found: symbols[found[0]], text)
+    signals = find_plant(plant).signals
+    symbols = {"Com": signals.command.symbol, "XJ": signals.controlled.symbol, "Cor": signals.drive.symbol}
+    return re.sub("|".join(symbols), lambda match: symbols[match[0]], text)
 
 
-def _tabulate_effects(chosen: Sequence[Effect], described: Sequence[Mapping[str, Any]]) -> list[Item]:
+def _tabulate_effects(effects: Sequence[Effect], descriptions: Sequence[Mapping[str, Any]]) -> list[Item]:
     rows: list[list[Cell | str]] = [[
         Cell(e.name, is_strong=True), e.port or "(reference)",
         "\n".join(f"{name.removeprefix(e.name + '.')} [{q.unit}]" for name, q in e.parameters.items()), row["symptoms"]]
-        for e, row in zip(chosen, described, strict=True)]
+        for e, row in zip(effects, descriptions, strict=True)]
     columns = [Column(title) for title in ("effect", "acts on", "parameters", "how to recognise it")]
     return [Table(columns, rows), Paragraph(
         "Give a model an effect with --set EFFECT.PARAMETER=VALUE; effects of the reference model have their own "
@@ -111,6 +111,6 @@ def _show_test(test: SelfTest, plant: str) -> Iterator[Item]:
                                    "same drive; and the largest change over the noise of its sensor.")
     yield from (Line("FAULT", f"{test.effect}: {fault}", "bad") for fault in test.faults)
     if not test.faults:
-        hidden = "" if test.visible or not test.shown else "; below the noise on this command"
+        remark = "" if test.visible or not test.shown else "; below the noise on this command"
         yield Line("passed", f"{test.effect}: exact at its off value, finite, repeatable, compiled code equal "
-                             f"to plain Python{hidden}", "good")
+                             f"to plain Python{remark}", "good")

@@ -27,16 +27,17 @@ def run_command(args: argparse.Namespace) -> int:
 def verify(args: argparse.Namespace) -> int:
     """Print a line for each file that was changed, is missing or was added."""
     with show_progress(args, "verifying"):
-        found = verify_package(Path(args.verify), args.key or "")
+        verification = verify_package(Path(args.verify), args.key or "")
     lines = [Line(word, escape_control_characters(name), "bad") for word in ("changed", "missing", "added")
-             for name in getattr(found, word)]
-    verdict = "INTACT" if found.is_intact else "CHANGED"
-    sentence = (f"{count_nouns(found.files, 'file')} as sealed; signature: {found.signature}." if found.is_intact else
-                f"{count_nouns(len(lines), 'difference')} from the manifest; signature: {found.signature}.")
-    report = Report("evidence", args.verify, verdict, "good" if found.is_intact else "bad", sentence,
-                    files=[("seal", found.seal)], sections=[Section("Differences", lines)],
-                    data={"verdict": verdict, **found._asdict()})
-    return give_answer(report, args, 0 if found.is_intact else 1)
+             for name in getattr(verification, word)]
+    verdict = "INTACT" if verification.is_intact else "CHANGED"
+    sentence = (f"{count_nouns(verification.files, 'file')} as sealed; signature: {verification.signature}."
+                if verification.is_intact else
+                f"{count_nouns(len(lines), 'difference')} from the manifest; signature: {verification.signature}.")
+    report = Report("evidence", args.verify, verdict, "good" if verification.is_intact else "bad", sentence,
+                    files=[("seal", verification.seal)], sections=[Section("Differences", lines)],
+                    data={"verdict": verdict, **verification._asdict()})
+    return give_answer(report, args, 0 if verification.is_intact else 1)
 
 
 def pack(args: argparse.Namespace) -> int:
@@ -51,13 +52,13 @@ def pack(args: argparse.Namespace) -> int:
             "a place outside the runs that it packs")
     with show_progress(args, "reading") as progress:
         package = collect_runs(args.runs)
-        judged = [*(run.judged for run in package.runs), *package.lost]
+        runs = [*(run.judged for run in package.runs), *package.lost]
         if args.requirements:
             file = Path(args.requirements)
             package.listed.update(read_requirements(file))
-            require_listed(judged, package.listed, file)
+            require_listed(runs, package.listed, file)
             package.files[f"requirements/{file.name}"] = file
-        requirements = trace_requirements(judged, package.listed)
+        requirements = trace_requirements(runs, package.listed)
         created = datetime.fromtimestamp(read_epoch_ns() / 1e9, UTC).isoformat(timespec="seconds")
         index = add_index(package, requirements, created)
         seal = write_package(package.files, out, args.sign or "", progress)
@@ -69,7 +70,7 @@ def pack(args: argparse.Namespace) -> int:
         notes=[f"recorded with other versions than those of {BILL}: {', '.join(others)}"]
         if others else [],
         sections=[Section("Runs", [tabulate(
-            judged, (Column("run"), lambda run: run.name),
+            runs, (Column("run"), lambda run: run.name),
             (Column("verdict"), lambda run: Cell(run.verdict, MOODS.get(run.verdict, "doubtful"))))]),
             Section("Requirements", tabulate_requirements(requirements))],
         data={"package": str(out), "seal": seal, "files": len(package.files), **index})

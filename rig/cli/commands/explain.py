@@ -35,17 +35,17 @@ def run_command(args: argparse.Namespace) -> int:
     workers = parse_workers(args.workers)
     require(args.sensitivity or not (args.hide or args.workers), "--hide" if args.hide else "--workers",
             args.hide or args.workers, "--sensitivity beside it")
-    model, known = load_known_model(args)
-    hidden = args.hide.split(",") if args.hide else []
-    if hidden:
-        split_words(hidden, model.plant, args.trace)  # refuses names that are no effects
+    model, provenance = load_known_model(args)
+    hidden_effects = args.hide.split(",") if args.hide else []
+    if hidden_effects:
+        split_words(hidden_effects, model.plant, args.trace)  # refuses names that are no effects
     with show_progress(args, "reading") as progress:
         runs = read_runs(model, args.trace, args.repeat, args.holdout, list_signals(args))
         law_file = None if places.page is None else places.page.with_name(f"{places.page.stem}_law.py")
         answer, pattern = explain_runs(runs, args.seed, args.write_effect, progress, law_file)
         effect_file = args.write_effect or (str(law_file) if answer.law_effects else "")
         files = [*places.files, *([("effect", effect_file)] if effect_file else [])]
-        claims = _measure_claims(args, runs, answer, hidden, known.effect_files, workers, places, progress)
+        claims = _measure_claims(args, runs, answer, hidden_effects, provenance.effect_files, workers, places, progress)
         report = build_explanation_report(answer, args.trace, args.model or "eha", runs.sources, format_command_line(),
                                           choose_next_command(args, answer, effect_file), pattern, runs.notes, files,
                                           claims)
@@ -63,13 +63,13 @@ def parse_workers(text: str | None) -> Workers:
     return Workers(int(text))
 
 
-def _measure_claims(args: argparse.Namespace, runs: Runs, answer: Answer, hidden: Sequence[str],
+def _measure_claims(args: argparse.Namespace, runs: Runs, answer: Answer, hidden_effects: Sequence[str],
                     effect_files: Sequence[str], workers: Workers, places: Places, progress: Progress) -> list[Claim]:
     """What --sensitivity finds, with its rows in a file beside the page or in this folder; nothing without it."""
     if not args.sensitivity:
         return []
     files = [str(Path(file).absolute()) for file in effect_files]
-    unit = describe_unit(runs, answer, hidden, files)
+    unit = describe_unit(runs, answer, hidden_effects, files)
     page = places.page or places.answer or Path("explain.html")
     return measure_sensitivity(unit, answer, page.with_name(f"{page.stem}_sensitivity.jsonl"), workers, progress)
 
@@ -83,9 +83,9 @@ def choose_next_command(args: argparse.Namespace, answer: Answer, effect_file: s
         both = (*answer.law.base.effects, *answer.law_effects)
         return f"rig add {' '.join(both)} {arguments} --effects {effect_file}"
     if answer.verdict in ("EXPLAINED", "PARTLY", "AMBIGUOUS") and effects:
-        shared = list_shared_effects(answer.explanation)
-        chosen = effects if answer.verdict != "AMBIGUOUS" else dict.fromkeys([*shared, *answer.best.effects])
-        return f"rig add {' '.join(chosen)} {arguments}"
+        shared_effects = list_shared_effects(answer.explanation)
+        names = effects if answer.verdict != "AMBIGUOUS" else dict.fromkeys([*shared_effects, *answer.best.effects])
+        return f"rig add {' '.join(names)} {arguments}"
     if answer.verdict == "UNEXPLAINED" and args.write_effect:
         return f"rig explain {arguments} --effects {args.write_effect}"
     if answer.verdict == "UNEXPLAINED" and answer.pattern and can_balance(answer.explanation.search.model):

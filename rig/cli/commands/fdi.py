@@ -30,10 +30,11 @@ def run_command(args: argparse.Namespace) -> int:
     with show_progress(args) as progress:
         bands = None if args.bands is None else load_bands(Path(args.bands), model.kind)
         faults = choose_faults(args.faults, model.kind)
-        found = diagnose(Trace.read(args.trace, signals=model.kind.signals), model, bands, progress, args.trace,
-                         with_effects=args.with_effects, faults=faults)
-    report = replace(build_diagnosis_report(found), next_command=suggest_next_command(args, found), files=places.files)
-    return give_answer(report, args, int(found.verdict != "ACCEPTABLE"), places)
+        diagnosis = diagnose(Trace.read(args.trace, signals=model.kind.signals), model, bands, progress, args.trace,
+                             with_effects=args.with_effects, faults=faults)
+    report = replace(build_diagnosis_report(diagnosis), next_command=suggest_next_command(args, diagnosis),
+                     files=places.files)
+    return give_answer(report, args, int(diagnosis.verdict != "ACCEPTABLE"), places)
 
 
 def learn_bands(args: argparse.Namespace) -> int:
@@ -59,10 +60,10 @@ def learn_bands(args: argparse.Namespace) -> int:
     return give_answer(build_bands_report(bands, args.out), args)
 
 
-def suggest_next_command(args: argparse.Namespace, found: Diagnosis) -> str:
+def suggest_next_command(args: argparse.Namespace, diagnosis: Diagnosis) -> str:
     """What to type next where no fault explains the trace: the search for other effects, or after it
     `rig explain`; else "".
     """
-    if found.verdict != "SOMETHING_ELSE":
+    if diagnosis.verdict != "SOMETHING_ELSE":
         return ""
-    return f"rig {'fdi --with-effects' if found.beside is None else 'explain'} {format_arguments(args)}"
+    return f"rig {'fdi --with-effects' if diagnosis.beside is None else 'explain'} {format_arguments(args)}"

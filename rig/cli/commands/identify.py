@@ -29,18 +29,19 @@ def run_command(args: argparse.Namespace) -> int:
     command = format_command_line()
     with show_progress(args, "reading") as progress:
         runs = read_identification_runs(model, ranges, args.runs, args.holdout, list_signals(args))
-        found = identify_model(runs.model, ranges, runs.fitted, runs.held_out, runs.sources, args.seed, progress)
-    files, is_wanted, next_command = [("page", str(page))], found.verdict != "CANNOT_TELL", ""
-    if found.verdict == "UNEXPLAINED":
+        identification = identify_model(runs.model, ranges, runs.fitted, runs.held_out, runs.sources, args.seed,
+                                        progress)
+    files, is_wanted, next_command = [("page", str(page))], identification.verdict != "CANNOT_TELL", ""
+    if identification.verdict == "UNEXPLAINED":
         note = (f"{path} was written because of --out; its parameters do not explain the runs" if args.out else
                 "no model file: these parameters do not explain the runs; --out FILE.toml writes them all the same")
-        found, is_wanted = replace(found, notes=(*found.notes, note)), bool(args.out)
+        identification, is_wanted = replace(identification, notes=(*identification.notes, note)), bool(args.out)
     elif is_wanted:
         trust = [] if model.plant in list_plants() else ["--trust"]  # the model file names code
         next_command = "rig compare " + shlex.join([(args.holdout or args.runs)[0], "--model", str(path), *trust])
     if is_wanted:
-        found = replace(found, model=replace(found.model, name=path.stem))
-        backup = write_identified_model(found, path, command, date.today().isoformat())
+        identification = replace(identification, model=replace(identification.model, name=path.stem))
+        backup = write_identified_model(identification, path, command, date.today().isoformat())
         files.insert(0, ("model", str(path) + (f" (the one before: {backup})" if backup is not None else "")))
-    report = build_identification_report(found, found.before.name, command, next_command, files)
-    return give_answer(report, args, int(found.verdict != "IDENTIFIED"), Places(page))
+    report = build_identification_report(identification, identification.before.name, command, next_command, files)
+    return give_answer(report, args, int(identification.verdict != "IDENTIFIED"), Places(page))

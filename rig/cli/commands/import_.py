@@ -65,10 +65,10 @@ def import_own(args: argparse.Namespace, source: Path, out: Path) -> int:
 def import_by_map(args: argparse.Namespace, source: Path, out: Path) -> int:
     """Import the columns or frames that --map names."""
     model = load_declared_model(args)
-    chosen = read_map(Path(args.map), model.kind.signals)
-    measurement = open_source(args, source, chosen)
-    imported = import_measurement(measurement, chosen, model["controller.period"])
-    write_imported(imported.trace, chosen, out)
+    import_map = read_map(Path(args.map), model.kind.signals)
+    measurement = open_source(args, source, import_map)
+    imported = import_measurement(measurement, import_map, model["controller.period"])
+    write_imported(imported.trace, import_map, out)
     return give_answer(build_import_report(imported, measurement, out), args)
 
 
@@ -80,11 +80,11 @@ def write_guess(args: argparse.Namespace, source: Path, out: Path) -> int:
     return give_answer(build_guess_report(guessed, measurement, out, args.model), args)
 
 
-def open_source(args: argparse.Namespace, source: Path, chosen: ImportMap | None) -> Measurement:
+def open_source(args: argparse.Namespace, source: Path, import_map: ImportMap | None) -> Measurement:
     """Open a recording; the map says how a text file is written."""
     with show_progress(args, "reading"):
         if source.suffix in RAW_SUFFIXES:
             return open_can_log(source, Path(args.dbc or dbc.DBC))
-        if chosen is None:
+        if import_map is None:
             return open_measurement(source)
-        return open_measurement(source, chosen.file.separator, chosen.file.decimal, chosen.file.header)
+        return open_measurement(source, import_map.file.separator, import_map.file.decimal, import_map.file.header)

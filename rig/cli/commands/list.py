@@ -28,19 +28,19 @@ def run_command(args: argparse.Namespace) -> int:
     find, use = KINDS[args.kind]
     require(args.faults is None or args.kind == "faults", "--faults", args.faults, f"rig list faults, not {args.kind}")
     model = load_chosen_model(args)
-    listed = list_faults(model, args.faults) if args.kind == "faults" else find(model)
-    rows = [row for row in listed if args.word.lower() in row["name"].lower()]
+    rows = list_faults(model, args.faults) if args.kind == "faults" else find(model)
+    rows = [row for row in rows if args.word.lower() in row["name"].lower()]
     return give_answer(build_list_report(args.kind, use, rows), args)
 
 
 def build_list_report(kind: str, use: str, rows: Rows) -> Report:
     """Report on the names of one kind."""
     keys = [*rows[0]] if rows else ["name"]
-    shown = [[Cell(_format(row[key]), is_strong=key == "name") for key in keys] for row in rows]
+    cells = [[Cell(_format(row[key]), is_strong=key == "name") for key in keys] for row in rows]
     sentence = (count_nouns(len(rows), "bench" if kind == "benches" else kind.removesuffix("s"), kind) if rows
                 else f"no {kind} of that name")
     return Report("list", kind, sentence=f"{sentence}. {use}", data={"kind": kind, kind: rows},
-                  sections=[Section("", [Table([Column(key) for key in keys], shown)] if rows else [])])
+                  sections=[Section("", [Table([Column(key) for key in keys], cells)] if rows else [])])
 
 
 def _format(value: Any) -> str:
@@ -82,9 +82,9 @@ def list_sequences(model: Model) -> Rows:
     """The shipped sequences."""
     from rig.sequences import load_sequence, sequence  # here: only this list and that of the checks need the bench
 
-    found = [(name, load_sequence(name)) for name in sequence.list_shipped()]
+    sequences = [(name, load_sequence(name)) for name in sequence.list_shipped()]
     return [{"name": name, "title": s.title, "main, s": s.duration, "checks": len(s.checks), "faults": len(s.faults)}
-            for name, s in found]
+            for name, s in sequences]
 
 
 def list_effects(model: Model) -> Rows:
@@ -117,18 +117,18 @@ def _describe_keys(kind: type[Any], base: type[Any]) -> Iterator[str]:
 
 def list_models(model: Model) -> Rows:
     """The shipped models: what --model takes beside a file."""
-    found = [(name, load_model(name)) for name in (*list_plants(), *SHIPPED_MODELS)]
+    models = [(name, load_model(name)) for name in (*list_plants(), *SHIPPED_MODELS)]
     return [{"name": name, "plant": m.plant, "cycle, s": m["controller.period"],
-             "effects": "\n".join(m.effects) or "-", "default": "yes" if name == "eha" else "no"} for name, m in found]
+             "effects": "\n".join(m.effects) or "-", "default": "yes" if name == "eha" else "no"} for name, m in models]
 
 
 def list_benches(model: Model) -> Rows:
     """The shipped benches: what --bench takes beside a file."""
     from rig.benches import bench_file  # here: only this list needs the frames
 
-    found = [(name, bench_file.load_bench(name)) for name in bench_file.list_benches()]
+    benches = [(name, bench_file.load_bench(name)) for name in bench_file.list_benches()]
     return [{"name": name, "title": b.name, "protocol": "canopen" if b.nodes else "can", "plant": b.plant,
-             "cycle, s": b.cycle_ns / 1e9, "frames": len(b.frames.frames)} for name, b in found]
+             "cycle, s": b.cycle_ns / 1e9, "frames": len(b.frames.frames)} for name, b in benches]
 
 
 def list_shipped_plants(model: Model) -> Rows:
@@ -143,12 +143,12 @@ def list_faults(model: Model, source: str | None = None) -> Rows:
     from fdi.diagnosis.faults import choose_faults, list_fault_files, load_faults  # here: only this list needs them
 
     if source is not None or model.kind.faults:
-        found = {source or model.plant: choose_faults(source, model.kind)}
+        lists = {source or model.plant: choose_faults(source, model.kind)}
     else:
-        found = {name: load_faults(name, model.kind) for name in list_fault_files()} if model.plant == "eha" else {}
+        lists = {name: load_faults(name, model.kind) for name in list_fault_files()} if model.plant == "eha" else {}
     return [{"name": f.name, "list": name, "title": f.title, "parameter": f.parameter, "unit": f.unit,
              "healthy": f.healthy, "acceptable": f.acceptable, "maintenance": f.maintenance,
-             "range": f"{f.range[0]:g} .. {f.range[1]:g}"} for name, faults in found.items() for f in faults]
+             "range": f"{f.range[0]:g} .. {f.range[1]:g}"} for name, faults in lists.items() for f in faults]
 
 
 KINDS: Mapping[str, tuple[Callable[[Model], Iterable[dict[str, Any]]], str]] = {  # what lists them, and how to use one

@@ -102,13 +102,13 @@ def _name_from(path: Path, file: str | Path) -> str:
 
 def build_new_report(path: Path, text: str, problem: str) -> Report:
     """Report on a file that was written: what is unsure in it, and what is missing."""
-    marked = [line.strip() for line in text.splitlines() if UNSURE in line]
-    unsure = "; check what it marks as unsure" if marked else ""
+    unsure_lines = [line.strip() for line in text.splitlines() if UNSURE in line]
+    unsure = "; check what it marks as unsure" if unsure_lines else ""
     sentence = f"{path} is to be completed: {problem}" if problem else f"{path} can be used{unsure}."
     return Report("new", str(path), "INCOMPLETE" if problem else "COMPLETE", "doubtful" if problem else "good",
-                  sentence, sections=[Section("Unsure", [Line("unsure", line) for line in marked])],
+                  sentence, sections=[Section("Unsure", [Line("unsure", line) for line in unsure_lines])],
                   data={"verdict": "INCOMPLETE" if problem else "COMPLETE", "file": str(path), "problem": problem,
-                        "unsure": marked})
+                        "unsure": unsure_lines})
 
 
 EXAMPLES = {"plant": ("plant", "models", "new_plant.py"), "effect": ("rig.cli", "new_effect.txt"),

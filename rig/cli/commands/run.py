@@ -85,13 +85,13 @@ def format_junit(outcome: Outcome, clock: WallClock) -> str:
     return write_junit_of_run(outcome, 1e-9 * clock.now())
 
 
-def choose_bus_of_run(args: argparse.Namespace, wanted: str, controller: str | None) -> tuple[str, str]:
+def choose_bus_of_run(args: argparse.Namespace, spec: str, controller: str | None) -> tuple[str, str]:
     """The bus of a run and why it is that one.
 
     Raises:
         RigError: a bus that is not there.
     """
-    bus, why = choose_bus(wanted)
+    bus, why = choose_bus(spec)
     return (bus, why) if controller != "c" or bus != "embedded" or args.bus != "auto" else (
         "udp_multicast", "udp_multicast: --controller c is a program and needs a bus between programs")
 
@@ -103,14 +103,14 @@ def choose_observer(job: Job, log: Path, place: ViewerPlace | None, *, is_live: 
     if not is_live:
         yield announce
         return
-    kept: list[Event] = []  # while a screen covers the terminal
+    events: list[Event] = []  # while a screen covers the terminal
     with show_live(make_live_plan(job.sequence, job.pace, job.bench), log, job.realtime, place) as begin:
         def observe(event: Event) -> None:
             begin()  # now the log is there
-            (kept.append if place is None else announce)(event)
+            (events.append if place is None else announce)(event)
 
         yield observe
-    for event in kept:
+    for event in events:
         announce(event)
 
 
@@ -145,7 +145,7 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
 
     Its last line repeats a verdict other than a plain PASS: the headline may have scrolled out of sight.
     """
-    timing, judged, fdi = outcome.timing, outcome.attribution.judged, outcome.fdi
+    timing, is_judged, fdi = outcome.timing, outcome.attribution.judged, outcome.fdi
     late = timing["lateness_us"]
     cycles = count_nouns(timing["cycles"], "cycle")
     pace = (f"{cycles}, {count_nouns(timing['overruns'], 'overrun')}; lateness p50 {late['p50']:g}, "
@@ -155,8 +155,8 @@ def add_outcome(report: Report, outcome: Outcome) -> Report:
     texts = {
         "timing": pace,
         "real time": timing["reason"],
-        "judged": "" if judged.all() else (f"{int(judged.sum())} of {len(judged)} cycles; the bench was late: "
-                                           f"{_list_counts(outcome.attribution.invalid)}"),
+        "judged": "" if is_judged.all() else (f"{int(is_judged.sum())} of {len(is_judged)} cycles; the bench was late: "
+                                              f"{_list_counts(outcome.attribution.invalid)}"),
         "first cause": outcome.describe_cause() if outcome.attribution.cause is not None else "",
         "missing": _list_counts(outcome.counters),
         "not nominal": differences if differences != "nothing" else "",

@@ -45,8 +45,8 @@ def run_command(args: argparse.Namespace) -> int:
         elif not (out or args.theme):
             progress("opening the viewer", 0.0)
             viewer.open_viewer(rrd)
-    written = "\n".join(dict.fromkeys(str(path) for path in (rrd, out) if path))
-    report = Report("view", join_words([args.trace, *args.others]), sentence=written, data=data)
+    sentence = "\n".join(dict.fromkeys(str(path) for path in (rrd, out) if path))
+    report = Report("view", join_words([args.trace, *args.others]), sentence=sentence, data=data)
     return show_in_browser(report, rrd, args) if args.theme else give_answer(report, args)
 
 
@@ -116,7 +116,7 @@ def draw(args: argparse.Namespace, progress: Progress) -> Drawing:
 def load_models(args: argparse.Namespace) -> tuple[Model, Model | None]:
     """The chosen model, and the same without --set and without added effects; None if it is the same."""
     model, _ = load_known_model(args)
-    bare, known = load_known_model(argparse.Namespace(**{**vars(args), "set": []}))
-    added = tuple(dict.fromkeys([*known.effects, *bare.effects]))
-    before = remove_all_effects(bare, replace(known, effects=added))
+    bare, provenance = load_known_model(argparse.Namespace(**{**vars(args), "set": []}))
+    effects = tuple(dict.fromkeys([*provenance.effects, *bare.effects]))
+    before = remove_all_effects(bare, replace(provenance, effects=effects))
     return model, None if (before.values, before.effects) == (model.values, model.effects) else before
