@@ -45,12 +45,12 @@ def require_measurable(holds: object, reason: str) -> None:
         raise NotMeasurable(reason)
 
 
-def bridge_gaps(signal: Array, name: str, allowed: float) -> Array:
-    """The signal with missing samples (NaN) on straight lines; NotMeasurable if more than a fraction `allowed` are."""
+def bridge_gaps(signal: Array, name: str, largest_share: float) -> Array:
+    """The signal with missing samples (NaN) on straight lines; NotMeasurable if more than `largest_share` are NaN."""
     missing = ~np.isfinite(signal)
     count = int(missing.sum())
     require_measurable(count < len(signal), f"{name} was not measured")
-    require_measurable(count <= allowed * len(signal), f"{count} of {len(signal)} samples of {name} are missing")
+    require_measurable(count <= largest_share * len(signal), f"{count} of {len(signal)} samples of {name} are missing")
     if not count:
         return signal
     rows = np.arange(len(signal))
@@ -124,9 +124,9 @@ def measure_response(signal: Array, com: Array, rate: float, frequency: float) -
     phase = 2 * np.pi * frequency * np.arange(len(com)) / rate
     basis = np.column_stack((np.sin(phase), np.cos(phase), np.ones(len(com))))
     (sine, cosine, _), *_ = np.linalg.lstsq(basis, np.column_stack((com, signal)), rcond=None)
-    asked, given = complex(sine[0], cosine[0]), complex(sine[1], cosine[1])
-    require_measurable(abs(asked) >= 1e-9, f"the command has no {frequency:g} Hz here")
-    return given / asked
+    command_phasor, signal_phasor = complex(sine[0], cosine[0]), complex(sine[1], cosine[1])
+    require_measurable(abs(command_phasor) >= 1e-9, f"the command has no {frequency:g} Hz here")
+    return signal_phasor / command_phasor
 
 
 def find_crossing(signal: Array, rate: float, above: float | None, below: float | None) -> float:
@@ -149,8 +149,8 @@ MAIN = "main"  # the window that is all of the main phase
 
 def map_words(values: NDArray[Any], find: Callable[[int], int]) -> NDArray[np.int64]:
     """What `find` gives for each of some words, most of which are equal."""
-    known, places = np.unique(values.astype(int), return_inverse=True)
-    return np.array([find(word) for word in known.tolist()], np.int64)[places]
+    words, places = np.unique(values.astype(int), return_inverse=True)
+    return np.array([find(word) for word in words.tolist()], np.int64)[places]
 
 
 class DriveFrames(NamedTuple):
@@ -163,8 +163,8 @@ class DriveFrames(NamedTuple):
 
     def select_between(self, t0: float, t1: float) -> Self:
         """Those with t0 <= t < t1."""
-        chosen = (self.t >= t0 - 1e-9) & (self.t < t1 - 1e-9)  # times come from ns
-        return self._replace(t=self.t[chosen], current=self.current[chosen], status=self.status[chosen])
+        is_within = (self.t >= t0 - 1e-9) & (self.t < t1 - 1e-9)  # times come from ns
+        return self._replace(t=self.t[is_within], current=self.current[is_within], status=self.status[is_within])
 
     @property
     def states(self) -> NDArray[np.int64]:
@@ -221,9 +221,9 @@ class RunData:
 
     def count_missing(self, name: str, span: slice) -> int:
         """How many samples of a signal were bridged."""
-        known = self.signals.names
-        name = self.signals.controlled.name if name in DERIVED and name not in known else name
-        column = getattr(self.trace, name) if name in known else np.zeros(0)  # an event has none
+        names = self.signals.names
+        name = self.signals.controlled.name if name in DERIVED and name not in names else name
+        column = getattr(self.trace, name) if name in names else np.zeros(0)  # an event has none
         return int(np.isnan(np.asarray(column, float)[span]).sum())
 
     def read_step(self, span: slice) -> StepResponse:
@@ -234,10 +234,10 @@ class RunData:
         from fdi.trace import measure_scale  # here: nodes, which judge nothing, start without recordings
 
         position, command = self.read_signal(self.signals.controlled.name, span), self.signals.command
-        commands, asked = getattr(self.trace, command.name), self.read_signal(command.name, span)
+        commands, demand = getattr(self.trace, command.name), self.read_signal(command.name, span)
         before = float(commands[span.start - 1] if span.start else position[0])
-        target, scale = float(asked[-1]), measure_scale(command, commands)
-        is_held = np.abs(asked - target).max() <= 1e-9 * scale
+        target, scale = float(demand[-1]), measure_scale(command, commands)
+        is_held = np.abs(demand - target).max() <= 1e-9 * scale
         require_measurable(abs(target - before) >= SMALLEST_STEP * scale and is_held,
                            "the command does not step here and then hold")
         return StepResponse(filter_median(position, self.rate), before, target, self.rate)
@@ -245,8 +245,8 @@ class RunData:
     def find_events(self, event: str, t0: float, t1: float = float("inf")) -> list[Any]:
         """Events in t0 <= t < t1 whose kind and text have all words of `event`, whatever their case, by time."""
         words = set(event.lower().split())
-        found = (e for e in self.events if t0 <= e.t < t1 and words <= set(f"{e.kind} {e.text}".lower().split()))
-        return sorted(found, key=lambda e: e.t)
+        events = (e for e in self.events if t0 <= e.t < t1 and words <= set(f"{e.kind} {e.text}".lower().split()))
+        return sorted(events, key=lambda e: e.t)
 
 
 LEFT_OPERATIONAL = "controller left OPERATIONAL:"  # words of the event
@@ -329,18 +329,18 @@ class Check:
             uncertainty, problem = self._compute_uncertainty(run, span, value)
             detail = "; ".join(filter(None, (detail, problem)))
         low, high = (nan if limit is None else limit for limit in (self.low, self.high))
-        passed = decide(value, low, high, uncertainty, run.metrology.decision)
+        is_passed = decide(value, low, high, uncertainty, run.metrology.decision)
         after, above, below = self._find_reference(run)
         return CheckResult(name=self.name, kind=self.kind, signal=self.about, value=value, unit=self.shown_unit,
-                           low=low, high=high, passed=passed is True, t0=t0, t1=t1, detail=detail, after=after,
+                           low=low, high=high, passed=is_passed is True, t0=t0, t1=t1, detail=detail, after=after,
                            above=above, below=below, requirement=", ".join(self.requirements), uncertainty=uncertainty,
-                           cannot_tell=passed is None)
+                           cannot_tell=is_passed is None)
 
     def _measure(self, run: RunData, span: slice) -> float:
         """The number, in the unit of the limits. Raises NotMeasurable."""
-        measured = KINDS[self.kind].measure(self, run, span) / self.scale
-        require_measurable(isfinite(measured), f"the measure came to {measured:g}")
-        return measured
+        number = KINDS[self.kind].measure(self, run, span) / self.scale
+        require_measurable(isfinite(number), f"the measure came to {number:g}")
+        return number
 
     def _compute_uncertainty(self, run: RunData, span: slice, value: float) -> tuple[float, str]:
         """U of the number, NaN if it is not known, and what is wrong with the calibrations that it depends on."""
@@ -350,16 +350,17 @@ class Check:
             except (NotMeasurable, ArithmeticError, ValueError):
                 return nan
 
-        signals, known = run.signals, run.metrology.calibration
+        signals, calibration = run.signals, run.metrology.calibration
         names = self._list_readings(signals)
-        missing = [s.name for s in signals if s.name in names and s.role in ("output", "load") and s.name not in known]
-        if missing and not (self.kind == "python" and known):  # which columns a function reads is not known
+        missing = [s.name for s in signals
+                   if s.name in names and s.role in ("output", "load") and s.name not in calibration]
+        if missing and not (self.kind == "python" and calibration):  # which columns a function reads is not known
             return nan, f"no calibration of {', '.join(missing)}"
         step = 1 / run.rate / self.scale if KINDS[self.kind].is_rounded else 0.0
-        found = compute_expanded_uncertainty(measure, value, run.trace, names, run.metrology, step)
-        open_ = ["errors of the sensor decide whether it can be measured"] if found == inf else []
-        return found, "; ".join([*(run.metrology.problems[name] for name in names if name in run.metrology.problems),
-                                 *open_])
+        uncertainty = compute_expanded_uncertainty(measure, value, run.trace, names, run.metrology, step)
+        open_ = ["errors of the sensor decide whether it can be measured"] if uncertainty == inf else []
+        return uncertainty, "; ".join([*(run.metrology.problems[name] for name in names
+                                         if name in run.metrology.problems), *open_])
 
     def _list_readings(self, signals: Signals) -> tuple[str, ...]:
         """The signals that the number depends on; the demand is exact."""
@@ -530,9 +531,9 @@ def _measure_shut_off(check: ShutOff, run: RunData, span: slice) -> float:
         is_off &= drives.states == find_state(CIA408, check.status)
     on = np.flatnonzero(~is_off)
     off = drives.t[int(on[-1]) + 1 if len(on) else 0:]
-    left = [event.t for event in run.find_events(LEFT_OPERATIONAL, after, span.stop / run.rate)
-            if not len(on) or event.t >= drives.t[on[-1]]]
-    times = [*off[:1].tolist(), *left[:1]]
+    exit_times = [event.t for event in run.find_events(LEFT_OPERATIONAL, after, span.stop / run.rate)
+                  if not len(on) or event.t >= drives.t[on[-1]]]
+    times = [*off[:1].tolist(), *exit_times[:1]]
     require_measurable(times, "the controller did not say zero current, nor did it leave OPERATIONAL")
     return float(min(times)) - after
 
@@ -670,11 +671,11 @@ class GuardWatch:
 
         A missing value (absent or NaN) is not outside, and does not count as back inside either.
         """
-        passed = None
+        first_guard = None
         for i, (guard, low, high) in enumerate(self._watched):
             value = values.get(guard.signal, nan)
             if value == value:
                 self._outside[i] = 0 if low <= value <= high else self._outside[i] + 1
-                if passed is None and self._outside[i] >= guard.cycles:
-                    passed = guard
-        return passed
+                if first_guard is None and self._outside[i] >= guard.cycles:
+                    first_guard = guard
+        return first_guard

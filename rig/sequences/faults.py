@@ -248,14 +248,14 @@ def move_bits(bits: int, size: int) -> int:
     >>> hex(move_bits(0x1_0000_0000, 32)), hex(move_bits(0x8000_8000, 16)), move_bits(-1, 8), move_bits(1, 0)
     ('0x1', '0x8001', 255, 0)
     """
-    moved = 0
+    mask = 0
     for place in range(64):
-        if bits >> place & 1 and moved != (1 << size) - 1:
+        if bits >> place & 1 and mask != (1 << size) - 1:
             free = place % size
-            while moved >> free & 1:
+            while mask >> free & 1:
                 free = (free + 1) % size
-            moved |= 1 << free
-    return moved
+            mask |= 1 << free
+    return mask
 
 
 def change_frame(code: int, argument: int, length: int, data: int) -> tuple[int, int]:
@@ -311,8 +311,8 @@ class Plan:
     def from_json(cls, data: object, plant: str = "eha") -> Self:
         """The plan that was sent, for this plant; InputError if it is none."""
         with name_signals_of(find_plant(plant).signals):
-            found: Self = tables.build_dataclass(cls, data, tables.Place("scenario"), {Fault: KINDS})
-        return replace(found, plant=plant)
+            plan: Self = tables.build_dataclass(cls, data, tables.Place("scenario"), {Fault: KINDS})
+        return replace(plan, plant=plant)
 
 
 @dataclass
@@ -364,8 +364,8 @@ class Schedule:
                 self.parameters.setdefault(fault.parameter, []).append((first, values))
             case Offset():  # or noise
                 shape = rng.standard_normal(cycles) if isinstance(fault, Noise) else np.ones(cycles)
-                added = fault.value * self._compute_growth(cycles, fault.ramp) * shape
-                self.signals.setdefault(fault.signal, []).append(SignalChange(first, last, added.tolist()))
+                offsets = fault.value * self._compute_growth(cycles, fault.ramp) * shape
+                self.signals.setdefault(fault.signal, []).append(SignalChange(first, last, offsets.tolist()))
             case Stuck():
                 self.signals.setdefault(fault.signal, []).append(SignalChange(first, last, value=fault.value))
             case Frames():
@@ -416,9 +416,9 @@ class Schedule:
 
     def list_frame_hits(self, name: str) -> Table:
         """The cycles in which something happens to a frame: (n, 3), cycle and the numbers of its `Action`."""
-        placed = self._frames.get(name, [])
-        table = np.zeros((max((first + len(hits) for first, hits in placed), default=0), 2), np.int64)
-        for first, hits in reversed(placed):  # the first fault acts, so it is written last
+        pieces = self._frames.get(name, [])
+        table = np.zeros((max((first + len(hits) for first, hits in pieces), default=0), 2), np.int64)
+        for first, hits in reversed(pieces):  # the first fault acts, so it is written last
             is_hit = hits[:, 0] != SENT_NORMALLY
             table[first:first + len(hits)][is_hit] = hits[is_hit]
         cycles = np.flatnonzero(table[:, 0])
@@ -471,7 +471,7 @@ def _choose_hits(fault: Frames, cycles: int, rng: np.random.Generator) -> Table:
             hits[is_hit, 1] = fault.length
         case Corrupted():
             bits = [rng.choice(64, fault.bits, replace=False) for _ in range(is_hit.sum())]
-            hits[is_hit, 1] = [np.bitwise_or.reduce(np.int64(1) << chosen) for chosen in bits]
+            hits[is_hit, 1] = [np.bitwise_or.reduce(np.int64(1) << frame_bits) for frame_bits in bits]
     return hits
 
 
@@ -483,7 +483,7 @@ def require_possible(faults: Sequence[Fault], bench: Bench, where: str) -> None:
     """
     frames = sorted({role for spec in bench.frames.frames for role in spec.roles})
     frames += ["sync"] if bench.frames.sync is not None else []
-    taken = bench.list_services() | {spec.identifier: spec.name for spec in bench.frames.frames}
+    identifiers = bench.list_services() | {spec.identifier: spec.name for spec in bench.frames.frames}
     for i, fault in enumerate(faults):
         match fault:
             case Frames() if fault.frame not in frames:
@@ -494,9 +494,9 @@ def require_possible(faults: Sequence[Fault], bench: Bench, where: str) -> None:
                 key, expected = "kind", f"a fault without NMT, which {bench.name!r} does not have, not 'reset'"
             case Silent() if not bench.nodes or (fault.node == "plant" and not bench.has_plant_node):
                 key, expected = "node", f"a node of {bench.name!r} with a heartbeat, not {fault.node!r}"
-            case Foreign() if fault.cob_id in taken:
+            case Foreign() if fault.cob_id in identifiers:
                 key, expected = "cob_id", (f"an identifier from 1 to 0x7FF that {bench.name!r} does not use; "
-                                           f"0x{fault.cob_id:X} is {taken[fault.cob_id]}")
+                                           f"0x{fault.cob_id:X} is {identifiers[fault.cob_id]}")
             case _:
                 continue
         raise InputError(where, f"faults[{i}].{key}", expected)
@@ -529,5 +529,5 @@ def find_contradiction(plan: Plan, model: Model) -> tuple[int, str] | None:
 
 def require_sensible(plan: Plan, model: Model) -> None:
     """Refuse faults whose parameters contradict each other or the model's own; raises InputError with the fault."""
-    if (found := find_contradiction(plan, model)) is not None:
-        raise InputError("faults", plan.faults[found[0]].label, found[1])
+    if (contradiction := find_contradiction(plan, model)) is not None:
+        raise InputError("faults", plan.faults[contradiction[0]].label, contradiction[1])

@@ -153,8 +153,8 @@ class ProtocolRecord:
 
     def join_rows(self) -> Rows:
         """The rows of the run with those in which the controller was enabled, and those after it, in order."""
-        played = (self.run,) if self.after is None else (self.run, self.after)
-        parts = [np.concatenate(columns) for columns in zip(*played, strict=True)]
+        pieces = (self.run,) if self.after is None else (self.run, self.after)
+        parts = [np.concatenate(columns) for columns in zip(*pieces, strict=True)]
         for cycle, rows in reversed(self.enabling):
             parts = [np.insert(whole, cycle, part) for whole, part in zip(parts, rows, strict=True)]
         return Rows(*parts)
@@ -170,17 +170,17 @@ def judge_protocol(record: ProtocolRecord, limits: ProtocolLimits) -> tuple[list
     judges: tuple[Callable[[ProtocolRecord, ProtocolLimits], Iterator[CheckResult | SkippedCheck]], ...] = (
         _judge_current, _judge_status, _judge_drive_frames, _judge_frozen, _judge_probes, _judge_response,
         _judge_heartbeats, _judge_emergencies)
-    found = [check for judge in judges for check in judge(record, limits)]
-    return ([check for check in found if isinstance(check, CheckResult)],
-            [check for check in found if isinstance(check, SkippedCheck)])
+    results = [check for judge in judges for check in judge(record, limits)]
+    return ([check for check in results if isinstance(check, CheckResult)],
+            [check for check in results if isinstance(check, SkippedCheck)])
 
 
 def _make_result(name: str, signal: str, value: float, unit: str, low: float = nan, high: float = nan,
                  detail: str = "") -> CheckResult:
     slack = 1e-9  # of the limit: a value in mA is a multiple of a count in A
-    passed = isfinite(value) and not (value < low * (1 - slack) or value > high * (1 + slack))  # no NaN limit is passed
+    is_passed = isfinite(value) and not (value < low * (1 - slack) or value > high * (1 + slack))  # NaN: no limit
     return CheckResult(name=name, kind=PROTOCOL, signal=signal, value=value, unit=unit, low=low, high=high,
-                       passed=passed, detail=detail)
+                       passed=is_passed, detail=detail)
 
 
 def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
@@ -188,16 +188,17 @@ def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[C
     rate = record.bench.rate
     idle = _drop_missing([rows.drive[find_idle(rows, record.words, limits, rate)] for rows in record.stretches])
     drive = record.bench.signals.drive
-    name, limited = f"no {drive.phrase} unless {record.words.active}", f"{drive.phrase} within its limit"
+    idle_name, limit_name = f"no {drive.phrase} unless {record.words.active}", f"{drive.phrase} within its limit"
     if record.bench.profile == "none" and not record.bench.enables:
-        yield SkippedCheck(name, "the bench has no control word, and no value of its phases enables the controller")
+        yield SkippedCheck(idle_name,
+                           "the bench has no control word, and no value of its phases enables the controller")
     else:
         largest = limits.idle_current + record.bench.find_least(drive.word)
-        yield _judge_largest(name, drive, idle, largest, f"{len(idle)} cycles")
+        yield _judge_largest(idle_name, drive, idle, largest, f"{len(idle)} cycles")
     if isnan(record.drive_limit):
-        yield SkippedCheck(limited, "the plant declares no limit of it")
+        yield SkippedCheck(limit_name, "the plant declares no limit of it")
     else:
-        yield _judge_largest(limited, drive, _drop_missing([rows.drive for rows in record.stretches]),
+        yield _judge_largest(limit_name, drive, _drop_missing([rows.drive for rows in record.stretches]),
                              record.drive_limit, "")
 
 
@@ -271,15 +272,15 @@ def list_wrong_changes(rows: Rows, delay: int) -> Iterator[str]:
     Before the first cycle it is switched off, or in fault.
     """
     states, control = find_states(rows, CIA402), rows.control.astype(int)
-    wanted = map_words(control, lambda word: find_wanted(CIA402, word))
+    target_states = map_words(control, lambda word: find_wanted(CIA402, word))
     rises = np.diff(control & CIA402.reset, prepend=0) > 0
-    answered = np.flatnonzero(~np.isnan(rows.drive))
-    before = np.concatenate(([int(State.NOT_READY)], states[answered]))[:-1]
-    for i in np.flatnonzero(states[answered] != before).tolist():
-        k, old = int(answered[i]), State(int(before[i]))
-        near = slice(max(0, int(answered[max(i - 1, 0)]) - delay), k + 1)
+    answers = np.flatnonzero(~np.isnan(rows.drive))
+    before = np.concatenate(([int(State.NOT_READY)], states[answers]))[:-1]
+    for i in np.flatnonzero(states[answers] != before).tolist():
+        k, old = int(answers[i]), State(int(before[i]))
+        near = slice(max(0, int(answers[max(i - 1, 0)]) - delay), k + 1)
         new = State(int(states[k]))
-        if new not in list_reachable(old, frozenset(wanted[near].tolist()), resets=bool(rises[near].any())):
+        if new not in list_reachable(old, frozenset(target_states[near].tolist()), resets=bool(rises[near].any())):
             names = [each.name.lower().replace("_", " ") for each in (new, old)]
             yield f"cycle {k}: {names[0]} after {names[1]} with control word 0x{control[k]:02X}"
 
@@ -301,19 +302,19 @@ def measure_status_ages(rows: Rows, faulty: Mask | None = None) -> Whole:
     word without READY and levels is right as well.
     """
     control, status = rows.control.astype(int), rows.status.astype(int) & (_LEVELS | _READY)
-    expected = find_expected_status(control)
-    matches = status == expected
+    expected_status = find_expected_status(control)
+    matches = status == expected_status
     if faulty is not None:
         matches |= faulty & (status & _READY == 0) & (status & _LEVELS == 0)
-    answered = ~np.isnan(rows.drive)
+    has_answer = ~np.isnan(rows.drive)
     ages = np.zeros(len(status), int)
-    if not (matches | ~answered).all():
+    if not (matches | ~has_answer).all():
         last: dict[int, int] = {}
-        for k, (wanted, is_like, said) in enumerate(zip(expected.tolist(), matches.tolist(), status.tolist(),
-                                                        strict=True)):
-            last[wanted] = k
-            ages[k] = 0 if is_like else k - last.get(said, -1)
-    return ages[answered]
+        for k, (expected_word, is_match, word) in enumerate(zip(expected_status.tolist(), matches.tolist(),
+                                                                status.tolist(), strict=True)):
+            last[expected_word] = k
+            ages[k] = 0 if is_match else k - last.get(word, -1)
+    return ages[has_answer]
 
 
 def find_expected_status(control: Whole) -> Whole:
@@ -341,27 +342,28 @@ def _find_faulty(record: ProtocolRecord) -> Mask:
 def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """Share of the cycles without a drive frame before the next SYNC, and with one of another cycle; unsound frames."""
     usual = 0.001 if record.realtime else 0.0
-    allowed = usual if limits.missing is None else limits.missing
+    largest_share = usual if limits.missing is None else limits.missing
     wrong = missing = cycles = 0
     for rows in record.stretches:
-        judged = rows.on_time & ~_find_faulty(record) if rows is record.run else rows.on_time
+        is_judged = rows.on_time & ~_find_faulty(record) if rows is record.run else rows.on_time
         flags = np.append(rows.flags[1:], 0).astype(int)  # what the plant found at the next SYNC
-        is_wrong = judged & (flags & int(Flags.DRIVE_LATE) != 0)
-        is_missing = judged & ~is_wrong & (np.isnan(rows.drive) | (flags & int(Flags.DRIVE_MISSING) != 0))
+        is_wrong = is_judged & (flags & int(Flags.DRIVE_LATE) != 0)
+        is_missing = is_judged & ~is_wrong & (np.isnan(rows.drive) | (flags & int(Flags.DRIVE_MISSING) != 0))
         wrong += int(is_wrong.sum())
         missing += int(is_missing.sum())
-        cycles += int(judged.sum())
-    own = record.bench.frames.list_from(Role.CONTROLLER)
-    is_numbered = any(spec.has("cycle") for spec in own)
+        cycles += int(is_judged.sum())
+    specs = record.bench.frames.list_from(Role.CONTROLLER)
+    is_numbered = any(spec.has("cycle") for spec in specs)
     for name, count, can_be_told in (("drive frames of another cycle", wrong, is_numbered),
                                      ("drive frames missing or late", missing, True)):
         if can_be_told:
             value = 100 * count / cycles if cycles else 0.0
-            yield _make_result(name, "drive", value, "%", high=100 * allowed, detail=f"{count} of {cycles}")
+            yield _make_result(name, "drive", value, "%", high=100 * largest_share, detail=f"{count} of {cycles}")
         else:
             yield SkippedCheck(name, "the controller's frames do not carry the number of the cycle")
-    if any(each.guard for spec in own for each in spec.fields):
-        yield _make_result("wrong checksums and alive counters", "drive", record.unsound, "1", high=allowed * cycles)
+    if any(each.guard for spec in specs for each in spec.fields):
+        yield _make_result("wrong checksums and alive counters", "drive", record.unsound, "1",
+                           high=largest_share * cycles)
 
 
 def _judge_frozen(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
@@ -372,8 +374,8 @@ def _judge_frozen(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[Ch
         yield SkippedCheck(name, "the law of the plant's controller is not one of the error alone")
         return
     change = measure_frozen(record.run, record.drive_limit if record.gains is not None else None, record.words)
-    scale, shown = (1e6, "um") if unit == "m" else (1.0, unit)
-    yield _make_result(name, signals.drive.word, change * scale, shown, high=round(record.still_limit * scale, 9))
+    scale, shown_unit = (1e6, "um") if unit == "m" else (1.0, unit)
+    yield _make_result(name, signals.drive.word, change * scale, shown_unit, high=round(record.still_limit * scale, 9))
 
 
 def measure_frozen(rows: Rows, limit: float | None, words: ProfileWords = CIA408) -> float:
@@ -384,9 +386,9 @@ def measure_frozen(rows: Rows, limit: float | None, words: ProfileWords = CIA408
     """
     largest = np.nanmax(np.abs(rows.drive), initial=0.0) if limit is None else limit
     is_limited = np.abs(rows.drive) >= 0.98 * largest
-    closed = _find_active(rows, words) & (find_states(rows, words) == State.ACTIVE) & ~is_limited
+    is_closed = _find_active(rows, words) & (find_states(rows, words) == State.ACTIVE) & ~is_limited
     error = rows.demand - rows.position
-    stays = closed[1:] & closed[:-1] & (rows.drive[1:] == rows.drive[:-1]) & ~np.isnan(error[1:] + error[:-1])
+    stays = is_closed[1:] & is_closed[:-1] & (rows.drive[1:] == rows.drive[:-1]) & ~np.isnan(error[1:] + error[:-1])
     edges = np.flatnonzero(np.diff(np.concatenate(([0], stays.astype(int), [0]))))
     ranges = [float(np.ptp(error[first:last + 1])) for first, last in edges.reshape(-1, 2) if last - first > 1]
     return max(ranges, default=0.0)
@@ -440,11 +442,11 @@ def measure_step_delay(probe: Rows, rate: float, words: ProfileWords = CIA408) -
 def measure_gain(probe: Rows, gains: object, words: ProfileWords = CIA408) -> tuple[float, str]:
     """Current in the ACTIVE cycles of a probe over that of the documented law with these gains, 1, and a remark."""
     active = _find_active(probe, words)
-    loop, wanted = Loop(), []
+    loop, currents = Loop(), []
     for demand, position in zip(probe.demand[active], probe.position[active], strict=True):
         current, loop = compute_current(loop, float(demand), float(position), gains)
-        wanted.append(current)
-    law, cor = np.array(wanted), probe.drive[active]
+        currents.append(current)
+    law, cor = np.array(currents), probe.drive[active]
     if np.isnan(law + cor).any():
         return nan, "frames of the probe are missing"
     return (float(law @ cor / (law @ law)), "") if law.any() else (nan, "the gains are zero")
@@ -472,10 +474,10 @@ def _judge_response(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[
     """From SYNC to the drive frame, in cycles that the bench delivered on time."""
     if not record.is_response_judged:
         return
-    known = _drop_missing([rows.response[rows.on_time] for rows in record.stretches]) * 1e6
+    times = _drop_missing([rows.response[rows.on_time] for rows in record.stretches]) * 1e6
     for name, share, limit, usual in (("p50", 50, limits.response_p50, 0.5), ("p99", 99, limits.response_p99, 0.9),
                                       ("max", 100, limits.response_max, 1.0)):
-        value, detail = (float(np.percentile(known, share)), f"{len(known)} cycles") if len(known) else (nan, NO_FRAME)
+        value, detail = (float(np.percentile(times, share)), f"{len(times)} cycles") if len(times) else (nan, NO_FRAME)
         high = usual * 1e6 / record.bench.rate if limit is None else limit * 1e6
         yield _make_result(f"response time, {name}", "drive", value, "us", high=high, detail=detail)
 
@@ -506,12 +508,12 @@ def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterato
 
 def _judge_emergencies(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """How many EMCY frames carry a code that is not documented for their node."""
-    name, allowed = "undocumented EMCY codes", {role: {*node.emcy} for role, node in record.bench.nodes.items()}
-    allowed.setdefault(Role.CONTROLLER, set()).update(limits.emcy)
-    if not allowed[Role.CONTROLLER]:
+    name, codes = "undocumented EMCY codes", {role: {*node.emcy} for role, node in record.bench.nodes.items()}
+    codes.setdefault(Role.CONTROLLER, set()).update(limits.emcy)
+    if not codes[Role.CONTROLLER]:
         yield SkippedCheck(name, "the bench file lists no EMCY codes of the controller (key emcy)" if record.bench.nodes
                            else "plain CAN has no EMCY")
         return
-    strange = [e for e in record.emergencies if e.code not in allowed.get(e.node, ())]
-    said = ", ".join(dict.fromkeys(f"node {record.bench.find_number(e.node)} 0x{e.code:04X}" for e in strange[:5]))
-    yield _make_result(name, "EMCY", float(len(strange)), "1", high=0.0, detail=said)
+    strange = [e for e in record.emergencies if e.code not in codes.get(e.node, ())]
+    detail = ", ".join(dict.fromkeys(f"node {record.bench.find_number(e.node)} 0x{e.code:04X}" for e in strange[:5]))
+    yield _make_result(name, "EMCY", float(len(strange)), "1", high=0.0, detail=detail)

@@ -106,8 +106,8 @@ def require_function_name(text: str) -> tuple[str, str]:
     return match[1], match[2]
 
 
-def load_function(module: ModuleType, name: str, given: int, arguments: Mapping[str, Argument]) -> Callable[..., Any]:
-    """A function of a user's module that takes so many values and these named arguments.
+def load_function(module: ModuleType, name: str, count: int, arguments: Mapping[str, Argument]) -> Callable[..., Any]:
+    """A function of a user's module that takes `count` values and these named arguments.
 
     Where it raises an exception or ends the program, it raises InputError, which names file and line.
 
@@ -119,15 +119,15 @@ def load_function(module: ModuleType, name: str, given: int, arguments: Mapping[
         raise InputError(file, name, "a function of this name in that file")
     with contextlib.suppress(ValueError):  # a function in C without a signature
         try:
-            inspect.signature(function).bind(*range(given), **arguments)
+            inspect.signature(function).bind(*range(count), **arguments)
         except TypeError as error:
             line = function.__code__.co_firstlineno if inspect.isfunction(function) else 1
-            named = f" and the arguments {', '.join(arguments)}" if arguments else ""
-            raise InputError(f"{file}:{line}", name, f"a function of {given} value{'s' if given > 1 else ''}{named} "
+            names = f" and the arguments {', '.join(arguments)}" if arguments else ""
+            raise InputError(f"{file}:{line}", name, f"a function of {count} value{'s' if count > 1 else ''}{names} "
                                                      f"({error})") from error
 
-    def call(*values: object, **named: Argument) -> Any:
+    def call(*values: object, **keywords: Argument) -> Any:
         with explain_errors(file, name):
-            return function(*values, **named)
+            return function(*values, **keywords)
 
     return call

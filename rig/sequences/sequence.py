@@ -229,8 +229,8 @@ class Sequence:
 
 def list_shipped() -> dict[str, Traversable]:
     """The sequences that come with the rig, by name."""
-    found = sorted(files("rig.sequences").iterdir(), key=lambda entry: entry.name)
-    return {Path(entry.name).stem: entry for entry in found if entry.name.endswith(".toml")}
+    entries = sorted(files("rig.sequences").iterdir(), key=lambda entry: entry.name)
+    return {Path(entry.name).stem: entry for entry in entries if entry.name.endswith(".toml")}
 
 
 def load_sequence(name_or_path: str | Path, rate: float = RATE, plant: str = "eha") -> Sequence:
@@ -292,13 +292,13 @@ def parse_sequence(text: str, name: str, read_file: ReadFile, rate: float = RATE
 
 def _find_plant(table: Mapping[str, Any], place: Place) -> str:
     """The plant that a sequence names, or that of its model, or ""; a model that cannot be read is refused later."""
-    chosen, named = table.get("model"), table.get("plant", "")
-    if named:
-        place.at("plant").require(isinstance(named, str),
+    model, plant = table.get("model"), table.get("plant", "")
+    if plant:
+        place.at("plant").require(isinstance(plant, str),
                                   "the name of a plant: a table belongs into a model file, for --model")
         with place.at("plant").locate():
-            return find_plant(named).key
-    name = chosen.get("name") if isinstance(chosen, dict) else None
+            return find_plant(plant).key
+    name = model.get("name") if isinstance(model, dict) else None
     with suppress(InputError):
         return load_model(name).plant if isinstance(name, str) else ""
     return ""
@@ -337,10 +337,10 @@ def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Seq
             return replace(part, function=load_function(modules[file], name, part.given, part.arguments))
         return part
 
-    filled: dict[str, Any] = {
+    parts: dict[str, Any] = {
         key: tuple(fill_in(part, key, place.at(key, i)) for i, part in enumerate(getattr(sequence, key)))
         for key in (*PHASES, "checks", "steps")}
-    return replace(sequence, files=embedded, **filled)
+    return replace(sequence, files=embedded, **parts)
 
 
 def _read_column(file: str, read: Callable[[str, Place, str], bytes], phase: str, here: Place, period: float,
@@ -364,9 +364,9 @@ def _check_phases(sequence: Sequence, place: Place) -> None:
         for i, segment in enumerate(getattr(sequence, phase)):
             with place.at(phase, i).locate(has_field=True):
                 segment.require_rate(sequence.rate)
-        called = list_section_names(getattr(sequence, phase))
-        for i, name in enumerate(called):
-            place.at(phase, i, "name").require(name not in called[:i], f"a name used once, not a second {name!r}")
+        names = list_section_names(getattr(sequence, phase))
+        for i, name in enumerate(names):
+            place.at(phase, i, "name").require(name not in names[:i], f"a name used once, not a second {name!r}")
             place.at(phase, i, "name").require(name != MAIN, f"another name than {MAIN!r}, which is all of main")
     _check_sizes(sequence, place)
     place.at("main").require(sequence.main, "at least one segment")
@@ -397,7 +397,7 @@ def _check_sizes(sequence: Sequence, place: Place) -> None:
 def _check_faults(sequence: Sequence, place: Place) -> None:
     """Each begins within main and acts for a cycle or more, and no two change one parameter at the same time."""
     plan = sequence.plan(0)
-    taken: dict[str, list[tuple[int, int]]] = {}
+    spans: dict[str, list[tuple[int, int]]] = {}
     for i, fault in enumerate(sequence.faults):
         place.at(i, "start").require(fault.start < sequence.duration,
                                      f"a time within main's {sequence.duration:g} s, not {fault.start:g}")
@@ -407,7 +407,7 @@ def _check_faults(sequence: Sequence, place: Place) -> None:
         if isinstance(fault, faults.Jitter) and fault.size * sequence.rate >= 1.0:
             raise place.at(i, "size").refuse(f"a time below a cycle, {1 / sequence.rate:g} s, not {fault.size:g}")
         if isinstance(fault, Parameter):
-            others = taken.setdefault(fault.parameter, [])
+            others = spans.setdefault(fault.parameter, [])
             place.at(i, "start").require(not any(first < b and a < last for a, b in others),
                                          f"a time when no other fault changes {fault.parameter}")
             others.append((first, last))
@@ -415,9 +415,9 @@ def _check_faults(sequence: Sequence, place: Place) -> None:
 
 def _check_parameters(sequence: Sequence, place: Place) -> None:
     """Parameters must exist, values must be in their range, and on the nominal model they must go together."""
-    chosen, plan = sequence.model, sequence.plan(0)
+    choice, plan = sequence.model, sequence.plan(0)
     overrides, injected = place.at("model", "overrides"), place.at("faults")
-    for name, value in chosen.overrides.items():
+    for name, value in choice.overrides.items():
         quantity = _find_meaning(name, overrides.at(name), sequence.plant)
         with overrides.at(name).locate():
             parse_value("", "", quantity, value)
@@ -426,13 +426,13 @@ def _check_parameters(sequence: Sequence, place: Place) -> None:
             quantity = _find_meaning(fault.parameter, injected.at(i, "parameter"), sequence.plant)
             with injected.at(i).locate(has_field=True):
                 fault.find_target(quantity)
-    if chosen.name == "eha":  # another model's values are known when it runs
+    if choice.name == "eha":  # another model's values are known when it runs
         try:
-            model = build_bare_model(sequence.plant).replace(chosen.overrides)
+            model = build_bare_model(sequence.plant).replace(choice.overrides)
         except InputError as error:
             raise overrides.refuse(f"{error.field} {error.expected}") from error
-        if (found := find_contradiction(plan, model)) is not None:
-            raise injected.at(found[0]).refuse(found[1])
+        if (contradiction := find_contradiction(plan, model)) is not None:
+            raise injected.at(contradiction[0]).refuse(contradiction[1])
 
 
 def _find_meaning(name: str, place: Place, plant: str) -> Quantity:
@@ -445,11 +445,11 @@ def _find_meaning(name: str, place: Place, plant: str) -> Quantity:
 def _check_checks(sequence: Sequence, place: Place) -> None:
     """Windows and faults that checks point at must be there; names are the lines of a table and must differ."""
     sections, labels = sequence.sections(), Counter(fault.label for fault in sequence.faults)
-    used = Counter(check.name for check in sequence.checks)
+    name_counts = Counter(check.name for check in sequence.checks)
     for i, check in enumerate(sequence.checks):
         window, after = check.window, getattr(check, "after", 0.0)
-        place.at(i, "name").require(used[check.name] == 1,
-                                    f"a name used once, not {used[check.name]} times {check.name!r}")
+        place.at(i, "name").require(name_counts[check.name] == 1,
+                                    f"a name used once, not {name_counts[check.name]} times {check.name!r}")
         is_known = not isinstance(window, str) or window == MAIN or window in sections
         place.at(i, "window").require(is_known, f"a section: {tables.list_choices(window, [MAIN, *sections])}")
         if isinstance(window, tuple) and window[1] > sequence.duration + 0.5 / sequence.rate:

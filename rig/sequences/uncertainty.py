@@ -94,11 +94,11 @@ def _draw_errors(name: str, metrology: Metrology, number: int, random: np.random
     shares = (np.arange(number) + 0.5) / number
     errors = np.zeros((number, 3))
     errors[:, 0] = metrology.counts.get(name, 0.0) / 2 * random.permutation(_QUANTILES["rectangular"](shares))
-    if (known := metrology.calibration.get(name)) is not None:
-        half_width = known.u * WIDTHS[known.distribution]
-        errors[:, 0] += half_width * random.permutation(_QUANTILES[known.distribution](shares))
-        errors[:, 1] = known.gain * random.permutation(_QUANTILES["normal"](shares))
-        errors[:, 2] = known.noise
+    if (calibration := metrology.calibration.get(name)) is not None:
+        half_width = calibration.u * WIDTHS[calibration.distribution]
+        errors[:, 0] += half_width * random.permutation(_QUANTILES[calibration.distribution](shares))
+        errors[:, 1] = calibration.gain * random.permutation(_QUANTILES["normal"](shares))
+        errors[:, 2] = calibration.noise
     return errors
 
 
