@@ -68,14 +68,14 @@ def run_batch(batch: Batch, file: RowFile, workers: Workers, report_progress: Ca
     """
     rows = {row[batch.key]: row for row in file.rows if row.get(batch.key) in batch.jobs and batch.is_valid(row)}
     missing = [job for number, job in batch.jobs.items() if number not in rows]
-    clock, before, failed = WallClock(), len(rows), 0
+    clock, before, failures = WallClock(), len(rows), 0
     with contextlib.closing(run_jobs(batch.work, missing, workers, batch.describe_failure)) as results:
-        for finished, (_, row) in enumerate(results, start=1):
+        for count, (_, row) in enumerate(results, start=1):
             file.append(row)
             rows[row[batch.key]] = row
-            failed += batch.is_failed(row)
-            left = clock.now() * 1e-9 / finished * (len(missing) - finished)
-            report_progress(BatchProgress(before + finished, len(batch.jobs), failed, left, row))
+            failures += batch.is_failed(row)
+            time_left = clock.now() * 1e-9 / count * (len(missing) - count)
+            report_progress(BatchProgress(before + count, len(batch.jobs), failures, time_left, row))
     return {number: rows[number] for number in batch.jobs}
 
 
@@ -137,16 +137,16 @@ def run_on_cluster(client: Any, work: Callable[[Job], Result], jobs: Sequence[Jo
         RigError: the cluster is gone, or `work` raises it.
     """
     waiting, submitted = iter(jobs), {}
-    finished = _import_distributed().as_completed(loop=client.loop)
+    futures = _import_distributed().as_completed(loop=client.loop)
 
     def submit(count: int) -> None:
         for job in itertools.islice(waiting, count):
             future = client.submit(work, job, pure=False)
             submitted[future] = job
-            finished.add(future)
+            futures.add(future)
 
     submit(ahead)
-    for future in _wait_for_futures(finished, client):
+    for future in _wait_for_futures(futures, client):
         job = submitted.pop(future)
         yield job, take_result(future, job, describe_failure)
         submit(1)
@@ -171,15 +171,15 @@ def take_result(future: Any, job: Job, describe_failure: Callable[[Job, str], Re
     return result
 
 
-def _wait_for_futures(finished: Any, client: Any, patience: float = 30.0) -> Iterator[Any]:
+def _wait_for_futures(futures: Any, client: Any, patience: float = 30.0) -> Iterator[Any]:
     """The futures as they are done.
 
     Raises:
         RigError: nothing has finished for `patience` s, and there is no worker.
     """
     clock, last = WallClock(), 0
-    while not finished.is_empty():
-        batch = finished.next_batch(block=False)
+    while not futures.is_empty():
+        batch = futures.next_batch(block=False)
         yield from batch
         if batch:
             last = clock.now()
@@ -371,11 +371,11 @@ class _Worker(Generic[Job]):
 
 def list_descendants(number: int) -> list[int]:
     """The processes that a process and their own ones started, where the kernel lists them (Linux)."""
-    found = []
+    children = []
     for file in Path(f"/proc/{number}/task").glob("*/children"):
         with contextlib.suppress(OSError):  # the thread has ended
-            found += [int(word) for word in file.read_text().split()]
-    return [*found, *(below for child in found for below in list_descendants(child))]
+            children += [int(word) for word in file.read_text().split()]
+    return [*children, *(below for child in children for below in list_descendants(child))]
 
 
 def _wait_for_messages(workers: Sequence[_Worker[Job]], clock: WallClock) -> list[_Worker[Job]]:

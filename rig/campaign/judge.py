@@ -81,8 +81,8 @@ class Settings:
 
     def list_values(self) -> dict[str, Any]:
         """JSON values, with a list of tolerances."""
-        given = self.tolerance if isinstance(self.tolerance, tuple) else (self.tolerance,)
-        return {**asdict(self), "tolerance": list(given)}
+        tolerances = self.tolerance if isinstance(self.tolerance, tuple) else (self.tolerance,)
+        return {**asdict(self), "tolerance": list(tolerances)}
 
 
 class Case(NamedTuple):
@@ -124,18 +124,18 @@ def build_matrix(tables: Mapping[str, Any], model: Model, work: str, where: obje
         InputError: an unknown key or effect, a value out of range, a plant without a nominal test, or no case at all.
     """
     place, outputs = Place(str(where)), [s.name for s in model.kind.signals.outputs]
-    measured = [",".join(outputs[:count]) for count in range(len(outputs), 0, -1)]
+    choices = [",".join(outputs[:count]) for count in range(len(outputs), 0, -1)]
     usual_hum = 0.35  # of the controlled signal's noise
-    given = {"hum": usual_hum * _find_noise(model), "signals": measured[0],
-             **{key: value for key, value in tables.items() if key != "case"}}
-    settings = build_dataclass(Settings, given, place)
-    require(settings.signals in measured, where, "signals", f"one of {' or '.join(measured)}, not {settings.signals!r}")
+    values = {"hum": usual_hum * _find_noise(model), "signals": choices[0],
+              **{key: value for key, value in tables.items() if key != "case"}}
+    settings = build_dataclass(Settings, values, place)
+    require(settings.signals in choices, where, "signals", f"one of {' or '.join(choices)}, not {settings.signals!r}")
     load_nominal_test(model.kind, model["controller.period"])
     blocks = tables.get("case", [])
     is_list = isinstance(blocks, list) and all(isinstance(block, Mapping) for block in blocks)
     require(blocks and is_list, where, "case", "at least one [[case]] (an empty one is a healthy plant)")
-    parsed = [_parse_block(block, given, model, place, faults) for block in blocks]
-    spec = {**settings.list_values(), **list_shared(model, work, faults), "case": parsed}
+    cases = [_parse_block(block, values, model, place, faults) for block in blocks]
+    spec = {**settings.list_values(), **list_shared(model, work, faults), "case": cases}
     return Matrix(spec, _expand_cases(spec))
 
 
@@ -189,15 +189,15 @@ def _expand_cases(spec: Mapping[str, Any]) -> tuple[Case, ...]:
 
     Each block's seeds are spread evenly over the campaign, so that the first cases are of every kind.
     """
-    found: dict[tuple[str, float, int], tuple[float, Case]] = {}  # places from 0 to 1, and cases
+    cases: dict[tuple[str, float, int], tuple[float, Case]] = {}  # places from 0 to 1, and cases
     for block in spec["case"]:
         for values in itertools.product(*block["sizes"].values()):
             sizes = dict(sorted(zip(block["sizes"], values, strict=True)))
             for tolerance, k in itertools.product(block["tolerance"], range(block["seeds"])):
                 seed = spec["first"] + k
                 case = Case(0, label_plant(sizes), sizes, tolerance, seed)
-                found.setdefault((case.label, tolerance, seed), ((k + 0.5) / block["seeds"], case))
-    ordered = sorted(found.values(), key=lambda pair: pair[0])  # stable: equal places keep the order of the file
+                cases.setdefault((case.label, tolerance, seed), ((k + 0.5) / block["seeds"], case))
+    ordered = sorted(cases.values(), key=lambda pair: pair[0])  # stable: equal places keep the order of the file
     return tuple(case._replace(number=number) for number, (_, case) in enumerate(ordered))
 
 
@@ -279,8 +279,8 @@ def simulate_case(case: Case, spec: Mapping[str, Any], model: Model) -> Trace:
     simulator: Simulator = simulate_unit if spec["simulator"] == OWN_SIMULATOR else import_function(
         spec["simulator"], "--simulator", "a simulator of units")
     columns = simulator(Unit(model, scatter, case.sizes, command, noise, restore_faults(spec)))
-    measured = {signals.command.name, signals.drive.name, "load", *spec["signals"].split(",")}
-    return Trace.from_columns({name: columns[name] for name in columns if name in measured}, period,
+    names = {signals.command.name, signals.drive.name, "load", *spec["signals"].split(",")}
+    return Trace.from_columns({name: columns[name] for name in columns if name in names}, period,
                               {"source": case.label, "seed": str(case.seed)}, signals)
 
 
@@ -344,10 +344,10 @@ def add_faults(model: Model, sizes: Mapping[str, float], faults: Sequence[Fault]
     The effect's further parameters follow: of a parameter of the base model in proportion to the first one (dynamic
     friction to static friction), of an added effect as in the start whose first parameter is nearest to the size.
     """
-    known = {fault.name: fault for fault in faults if tuple(faults) != FAULTS}
+    faults_by_name = {fault.name: fault for fault in faults if tuple(faults) != FAULTS}
     for name, size in sizes.items():
-        if name in known:
-            model = model.replace(known[name].list_changes(size), name)
+        if name in faults_by_name:
+            model = model.replace(faults_by_name[name].list_changes(size), name)
             continue
         effect = find_effect(name, model.plant)
         first, *others = effect.fitted
@@ -376,8 +376,8 @@ def judge_case(case: Case, spec: Mapping[str, Any], expected_sources: str) -> Ro
         trace = Trace.read(case.trace, signals=model.kind.signals) if case.trace else simulate_case(case, spec, model)
         start = clock.now()
         judge = _load_judgement(spec)
-        judged = judge(trace, model, restore_faults(spec)) if judge is judge_by_fdi else judge(trace, model)
-        row |= {"status": OK, **judged, "seconds": (clock.now() - start) * 1e-9}
+        judgement = judge(trace, model, restore_faults(spec)) if judge is judge_by_fdi else judge(trace, model)
+        row |= {"status": OK, **judgement, "seconds": (clock.now() - start) * 1e-9}
     except RigError as error:
         row |= {"status": REFUSED, "reason": " ".join(str(error).split())}
     except Exception as error:
@@ -434,26 +434,26 @@ def judge_by_fdi(trace: Trace, model: Model, faults: Sequence[Fault] = FAULTS) -
     """
     from fdi.diagnosis.diagnosis import diagnose
 
-    found = diagnose(trace, model, workers=count_threads(), faults=faults)
-    row: dict[str, Any] = {"verdict": found.verdict, "ruling": found.ruling or ""}
+    diagnosis = diagnose(trace, model, workers=count_threads(), faults=faults)
+    row: dict[str, Any] = {"verdict": diagnosis.verdict, "ruling": diagnosis.ruling or ""}
     for fault in faults:
-        size = found.sizes[fault.name]
-        row |= {f"level_{fault.name}": _format_level(found.levels[fault.name]), fault.key: size.value,
+        size = diagnosis.sizes[fault.name]
+        row |= {f"level_{fault.name}": _format_level(diagnosis.levels[fault.name]), fault.key: size.value,
                 f"{fault.key}_low": size.low, f"{fault.key}_high": size.high}
-    if found.band_verdict is not None:
-        levels, by = found.band_verdict.levels, found.band_verdict.severity
+    if diagnosis.band_verdict is not None:
+        levels, by = diagnosis.band_verdict.levels, diagnosis.band_verdict.severity
         row |= {**{f"band_{fault.name}": _format_level(levels.get(fault.name)) for fault in faults},
                 **{f"severity_{fault.name}": by[fault.name] for fault in faults if fault.name in by}}
-    for grid in found.grids[:1]:
+    for grid in diagnosis.grids[:1]:
         row |= {f"grid_{fault.key}": grid.find_size(fault, grid.merged) for fault in grid.faults}
-    if found.groups:
-        row["groups"] = [list(group) for group in found.groups]
+    if diagnosis.groups:
+        row["groups"] = [list(group) for group in diagnosis.groups]
     return row | {
-        "events": [event._asdict() for event in found.events], "event_count": len(found.events),
-        "correlation": found.refinement.correlation, "left_over": max(found.refinement.ratio.values()),
-        "simulations": found.refinement.simulations, "others": sorted(found.others),
-        "precursors": {name: precursor.value for name, precursor in found.precursors.items()},
-        "notes": list(found.notes)}
+        "events": [event._asdict() for event in diagnosis.events], "event_count": len(diagnosis.events),
+        "correlation": diagnosis.refinement.correlation, "left_over": max(diagnosis.refinement.ratio.values()),
+        "simulations": diagnosis.refinement.simulations, "others": sorted(diagnosis.others),
+        "precursors": {name: precursor.value for name, precursor in diagnosis.precursors.items()},
+        "notes": list(diagnosis.notes)}
 
 
 def _format_level(level: Level | None) -> str:
@@ -494,10 +494,10 @@ def run_campaign(matrix: Matrix, folder: str | Path, workers: Workers,
 
 def plan_batch(matrix: Matrix, sources: str, count: int | None = None, redo_failed: bool = False) -> Batch:
     """The first `count` cases of a matrix as a batch; `sources` is the hash of the code that may judge them."""
-    shared = {key: value for key, value in matrix.spec.items() if key not in ("case", "files")}
+    case_spec = {key: value for key, value in matrix.spec.items() if key not in ("case", "files")}
     return Batch(jobs={case.number: case for case in matrix.cases[:count]},
-                 work=partial(judge_case, spec=shared, expected_sources=sources), key="case",
-                 describe_failure=lambda case, reason: describe_case(case, shared) | {"reason": reason},
+                 work=partial(judge_case, spec=case_spec, expected_sources=sources), key="case",
+                 describe_failure=lambda case, reason: describe_case(case, case_spec) | {"reason": reason},
                  is_failed=_has_failed,
                  is_valid=lambda row: not (redo_failed and _has_failed(row)))
 
@@ -517,21 +517,21 @@ def open_campaign(path: str | Path, matrix: Matrix, sources: str) -> RowFile:
             was started, another process is at work in it, or it cannot be written.
     """
     folder = Path(path)
-    expected = json.loads(json.dumps({"matrix": matrix.spec, "code": sources}))
+    campaign = json.loads(json.dumps({"matrix": matrix.spec, "code": sources}))
     with report_system_error(path, "", "a folder that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
         if is_campaign_folder(folder):
             present = _read_campaign(folder)
-            if changed := [key for key in {**present["matrix"], **expected["matrix"]}
-                           if present["matrix"].get(key) != expected["matrix"].get(key)]:
+            if differences := [key for key in {**present["matrix"], **campaign["matrix"]}
+                               if present["matrix"].get(key) != campaign["matrix"].get(key)]:
                 raise InputError(path, "--out", "a folder of this matrix, or a new one; it differs in "
-                                                f"{', '.join(changed)}")
+                                                f"{', '.join(differences)}")
             require(present["code"] == sources, path, "--out",
                     "a new folder: the code has changed since this campaign was started")
         elif any(not file.name.startswith(".part-") for file in folder.iterdir()):
             raise InputError(path, "--out", "an empty folder, or one of this campaign")
         else:
-            write_text(folder / MATRIX, json.dumps(expected, indent=1) + "\n")
+            write_text(folder / MATRIX, json.dumps(campaign, indent=1) + "\n")
     return RowFile(folder / ROWS)
 
 

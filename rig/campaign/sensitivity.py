@@ -43,19 +43,19 @@ def measure_sensitivity(unit: Unit, answer: Answer, file: Path, workers: Workers
     report_progress("where the sizes begin", 0.0)
     first, key, clock, before = find_first_rungs(answer, unit.effects), hash_unit(unit), WallClock(), 0
 
-    def show(finished: BatchProgress, is_open: int, before: int) -> None:
-        made, decided = before + finished.done, len(unit.effects) - is_open
-        runs_left = finished.total - finished.done + TYPICAL_RUNS * is_open
-        minutes = 1e-9 * clock.now() / made * runs_left / 60.0
-        report_progress(f"{decided} of {len(unit.effects)} effects decided, runs explained: {made}, "
+    def show(progress: BatchProgress, is_open: int, before: int) -> None:
+        run_count, decided = before + progress.done, len(unit.effects) - is_open
+        runs_left = progress.total - progress.done + TYPICAL_RUNS * is_open
+        minutes = 1e-9 * clock.now() / run_count * runs_left / 60.0
+        report_progress(f"{decided} of {len(unit.effects)} effects decided, runs explained: {run_count}, "
                         f"about {minutes:.0f} min left", decided / len(unit.effects))
 
     with RowFile(file) as rows:
         while True:
-            known = [row for row in rows.rows if row.get("key") == key]
-            jobs = choose_injections(unit, first, known)
+            unit_rows = [row for row in rows.rows if row.get("key") == key]
+            jobs = choose_injections(unit, first, unit_rows)
             if not jobs:
-                return summarise_injections(unit, known)
+                return summarise_injections(unit, unit_rows)
             is_open = len({job.effect for job in jobs})
             batch = Batch({job.number: job for job in jobs}, partial(_make_row, unit=unit, key=key), "number",
                           partial(_describe_failure, key=key), lambda row: row.get("key") == key,

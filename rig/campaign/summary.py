@@ -52,13 +52,13 @@ def judge_rate(name: str, share: Share, least: float = 0.0, most: float = 1.0) -
     Too few are fewer than 20, or so few that a single wrong case would miss the range. They are enough when the whole
     interval is outside the range. From 0 to 1 nothing is required, and the share is for information.
     """
-    met = None
+    is_met = None
     if (least, most) != (0.0, 1.0) and share.of:
         if share.low > most or share.high < least:
-            met = False
+            is_met = False
         elif share.of >= max(20, round(1.0 / (most - least))):
-            met = least <= share.value <= most
-    return {"name": name, "share": format_share(share), "least": least, "most": most, "met": met}
+            is_met = least <= share.value <= most
+    return {"name": name, "share": format_share(share), "least": least, "most": most, "met": is_met}
 
 
 def format_share(share: Share) -> Figures:
@@ -74,16 +74,16 @@ def summarise_campaign(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) ->
     """
     levelled = [row for row in rows if row["status"] != OK or f"level_{faults[0].name}" in row]
     truth = f"true_{faults[0].key}"
-    simulated = [row for row in levelled if truth in row]
-    tolerances = sorted({row["tolerance"] for row in simulated})
-    shown = ("label", "status", "ruling", *(f"level_{fault.name}" for fault in faults),
-             *(fault.key for fault in faults), "trust")
+    plant_rows = [row for row in levelled if truth in row]
+    tolerances = sorted({row["tolerance"] for row in plant_rows})
+    columns = ("label", "status", "ruling", *(f"level_{fault.name}" for fault in faults),
+               *(fault.key for fault in faults), "trust")
     return {"cases": len(rows), "status": dict(Counter(row["status"] for row in rows)),
             "seconds": summarise_times(rows),
             "faults": [asdict(fault) for fault in faults],
-            "tolerances": [_summarise_tolerance(tolerance, [row for row in simulated if row["tolerance"] == tolerance],
+            "tolerances": [_summarise_tolerance(tolerance, [row for row in plant_rows if row["tolerance"] == tolerance],
                                                 faults) for tolerance in tolerances],
-            "traces": [{name: row.get(name) for name in shown} for row in levelled if truth not in row],
+            "traces": [{name: row.get(name) for name in columns} for row in levelled if truth not in row],
             "reasons": [{"case": row["label"], "seed": row["seed"], "status": row["status"], "reason": row["reason"]}
                         for row in rows if row["status"] != OK]}
 
@@ -91,12 +91,12 @@ def summarise_campaign(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) ->
 def _summarise_tolerance(tolerance: float, rows: Sequence[Row], faults: Sequence[Fault]) -> Figures:
     """The figures of the simulated plants of one tolerance."""
     false_alarms = [row for row in rows if row["label"] == HEALTHY and is_alarm(row, faults)]
-    shown = ("seed", "verdict", *(f"level_{fault.name}" for fault in faults))
+    columns = ("seed", "verdict", *(f"level_{fault.name}" for fault in faults))
     return {"tolerance": tolerance, "cases": len(rows), "rates": count_rates(rows, faults),
             "curves": {fault.name: count_detections(rows, fault) for fault in faults},
             "levels": {fault.name: count_levels(rows, fault, faults) for fault in faults},
             "ruling": count_ruling_faults(rows, faults), "errors": [*measure_errors(rows, faults)],
-            "false_alarms": [{key: row.get(key) for key in shown} for row in false_alarms]}
+            "false_alarms": [{key: row.get(key) for key in columns} for row in false_alarms]}
 
 
 def count_rates(rows: Sequence[Row], faults: Sequence[Fault] = FAULTS) -> list[Figures]:
@@ -135,8 +135,8 @@ def _count_off_grid_rates(rows: Sequence[Row]) -> Iterator[Figures]:
 
 def count_share(rows: Iterable[Row], is_good: Callable[[Row], bool]) -> Share:
     """The share of good rows."""
-    judged = [bool(is_good(row)) for row in rows]  # a row may have numbers of numpy
-    return measure_share(sum(judged), len(judged))
+    judgements = [bool(is_good(row)) for row in rows]  # a row may have numbers of numpy
+    return measure_share(sum(judgements), len(judgements))
 
 
 def is_alarm(row: Row, faults: Sequence[Fault] = FAULTS) -> bool:
@@ -173,14 +173,14 @@ def count_detections(rows: Sequence[Row], fault: Fault) -> list[Figures]:
     groups = {find_usual_size(healthy, fault): healthy} if healthy else {}
     for row in select_single_fault(rows, fault):
         groups.setdefault(true_size(row, fault), []).append(row)
-    counted: dict[str, Callable[[Row], bool]] = {
+    criteria: dict[str, Callable[[Row], bool]] = {
         "detected": partial(is_detected, fault=fault),
         "most": partial(is_detected, fault=fault, level=Level.NON_NOMINAL),
         "ruling": lambda row: row.get("ruling") == fault.name,
         "bands": partial(is_detected, fault=fault, judged_by="band")}
     in_bands = {size: [row for row in rows if f"band_{fault.name}" in row] for size, rows in groups.items()}
     return [{"size": size, **{name: format_share(count_share((in_bands if name == "bands" else groups)[size], is_good))
-                              for name, is_good in counted.items()}} for size in sorted(groups)]
+                              for name, is_good in criteria.items()}} for size in sorted(groups)]
 
 
 def find_usual_size(rows: Sequence[Row], fault: Fault) -> float:
@@ -266,8 +266,8 @@ def summarise_times(rows: Iterable[Row]) -> dict[str, float]:
 
 def describe_progress(progress: BatchProgress) -> str:
     """How far a campaign is: "120/1400, 2 failed, 35 min left"."""
-    failed = f", {progress.failed} failed" if progress.failed else ""
-    return f"{progress.done}/{progress.total}{failed}, {format_duration(progress.left)} left"
+    failures = f", {progress.failed} failed" if progress.failed else ""
+    return f"{progress.done}/{progress.total}{failures}, {format_duration(progress.left)} left"
 
 
 def build_campaign_report(figures: Mapping[str, Any], title: str = "campaign") -> Report:
@@ -323,10 +323,10 @@ def _tabulate_rates(rates: Sequence[Mapping[str, Any]]) -> Table:
                  "Detection and false-alarm rates beside what is required of them.")
 
 
-def _judge_rate(met: bool | None, required: str) -> Cell:
-    if met is None:
+def _judge_rate(is_met: bool | None, required: str) -> Cell:
+    if is_met is None:
         return Cell("too few" if required else "", "muted")
-    return Cell("met", "good") if met else Cell("NOT met", "bad")
+    return Cell("met", "good") if is_met else Cell("NOT met", "bad")
 
 
 def format_requirement(low: float, high: float) -> str:
@@ -418,14 +418,15 @@ def _draw_fault(fault: Fault, points: Sequence[Mapping[str, Any]]) -> list[Mark]
     span = max(abs(size - fault.healthy) for size in [*limits, *(point["size"] for point in points)])
     panel: list[Mark] = []
     for i, (key, label, colour) in enumerate(LINES):
-        known = [point for point in points if point[key]["of"]]
-        x = [point["size"] + 0.004 * (i - 1.5) * span for point in known]  # beside one another
-        y = [100 * point[key]["share"] for point in known]
-        ends = [[100 * abs(point[key]["share"] - point[key][end]) for point in known] for end in ("low", "high")]
+        curve_points = [point for point in points if point[key]["of"]]
+        x = [point["size"] + 0.004 * (i - 1.5) * span for point in curve_points]  # beside one another
+        y = [100 * point[key]["share"] for point in curve_points]
+        ends = [[100 * abs(point[key]["share"] - point[key][end]) for point in curve_points]
+                for end in ("low", "high")]
         panel.append(call("errorbar", x, y, ends, color=colour, lw=1.4, marker="o", ms=3.5, elinewidth=0.9, capsize=2,
                           label=label))
-    named = sorted(zip(limits, ("MidBand", "MaxBand"), strict=True))
-    for (size, word), side in zip(named, ("right", "left"), strict=True):  # above the curves, clear of one another
+    labels = sorted(zip(limits, ("MidBand", "MaxBand"), strict=True))
+    for (size, word), side in zip(labels, ("right", "left"), strict=True):  # above the curves, clear of one another
         panel += [instant(size, COMMAND, None, 0.9, "--"),
                   call("text", size, 104, word, color=INK, fontsize=8, va="bottom", ha=side)]
     return [*panel, axes(xlabel=f"{fault.name}, {fault.symbol}{fault.bracketed_unit}")]
