@@ -103,14 +103,14 @@ class BenchRun:
             InputError: a name that no check has.
         """
         __tracebackhide__ = True
-        chosen = [*map(self._find_check, names)] if names else list(self.outcome.checks)
-        failed = [check for check in chosen if not check.passed]
-        if not failed and (names or self.verdict in ("PASS", "NOT_JUDGED")):
+        checks = [*map(self._find_check, names)] if names else list(self.outcome.checks)
+        failed_checks = [check for check in checks if not check.passed]
+        if not failed_checks and (names or self.verdict in ("PASS", "NOT_JUDGED")):
             return
         title = self.outcome.job.sequence.title
-        lines = [f"{title}: {len(failed)} of {len(chosen)} checks failed" if failed else
-                 f"{title}: {self.verdict}, {self.why}", *map(describe_failure, failed)]
-        close_ups = [picture for check in failed[:3] if (picture := self.write_close_up(check.name)) is not None]
+        lines = [f"{title}: {len(failed_checks)} of {len(checks)} checks failed" if failed_checks else
+                 f"{title}: {self.verdict}, {self.why}", *map(describe_failure, failed_checks)]
+        close_ups = [picture for check in failed_checks[:3] if (picture := self.write_close_up(check.name)) is not None]
         pictures = [f"picture: {picture}" for picture in close_ups or [self.write_picture()]]
         raise CheckFailedError("\n".join([*lines, *pictures, f"page: {self.write_page()}"]))
 
@@ -159,12 +159,12 @@ class Bench:
         __tracebackhide__ = True  # pytest shows the line of the test
         folder = self.folder / f"run-{len(self.runs) + 1}"
         try:
-            chosen = self.model if model is None else str(model)
-            choice = JobChoice("", chosen, set or {}, seed, tuple(map(Path, effects)), str(bench))
+            model_name = self.model if model is None else str(model)
+            choice = JobChoice("", model_name, set or {}, seed, tuple(map(Path, effects)), str(bench))
             tested, plant = load_tested_plant(choice)
-            built = build_sequence(None if sequence is None else str(sequence), command, tested.rate, plant,
-                                   faults=faults, checks=checks, load=load, guards=guards)
-            job = build_job(choice._replace(sequence=built.name), built)
+            test_sequence = build_sequence(None if sequence is None else str(sequence), command, tested.rate, plant,
+                                           faults=faults, checks=checks, load=load, guards=guards)
+            job = build_job(choice._replace(sequence=test_sequence.name), test_sequence)
             run = BenchRun(folder, run_job(job, folder, ignore_progress, lambda: False))
         except InputError as error:
             raise InputError(error.where, error.field, error.expected) from None
@@ -189,17 +189,17 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
     Raises:
         InputError: a sequence or entry that cannot be used.
     """
-    added = {key: list(entries) for key, entries in more.items() if len(entries)}
+    additions = {key: list(entries) for key, entries in more.items() if len(entries)}
     if command is None:
-        named = load_sequence(sequence or "preflight", rate, plant)
-        if not added:
-            return named
-        table, files, name = tomllib.loads(named.source), dict(named.files), named.name
+        base = load_sequence(sequence or "preflight", rate, plant)
+        if not additions:
+            return base
+        table, files, name = tomllib.loads(base.source), dict(base.files), base.name
     else:
         require(sequence is None, "sequence", str(sequence), "either a sequence or a command")
         table, files = _make_table(command, rate, find_plant(plant).signals.command.name)
         name = "command.toml"
-    table |= {key: [*table.get(key, []), *entries] for key, entries in added.items()}
+    table |= {key: [*table.get(key, []), *entries] for key, entries in additions.items()}
 
     def read_file(file: str) -> bytes:
         require(file in files, file, "", "a file of the sequence")
