@@ -85,12 +85,12 @@ def follow_log(path: Path, signals: Signals = EHA) -> Iterator[list[tuple[int, R
         with path.open("rb", buffering=0) as file:
             while True:
                 file.seek(done)
-                found, start = list[tuple[int, Record]](), 0
+                records, start = list[tuple[int, Record]](), 0
                 for raw, end in _list_chunks(file.read()):
                     start = end
-                    found += _decode_messages(raw, decoders)
+                    records += _decode_messages(raw, decoders)
                 done += start
-                yield found
+                yield records
 
 
 def _decode_messages(raw: bytes, decoders: dict[int, Any]) -> Iterator[tuple[int, Record]]:
@@ -128,12 +128,12 @@ def draw_screen(run: LiveRun, width: int, height: int, silence: float) -> Text:
                                (controlled.phrase, "bold blue")))
     com, xj = (s.shown_scale * run.read_last(s.name, round(5 * run.plan.rate)) for s in (command, controlled))
     lines += draw_plot({"white": com, "bold blue": xj}, width, plot_height, 0.2)
-    left, right = _draw_checks(run, lower), [*_draw_timing(run), *_draw_events(run, lower)][:lower]
+    left_lines, right_lines = _draw_checks(run, lower), [*_draw_timing(run), *_draw_events(run, lower)][:lower]
     for number in range(lower):
-        line = left[number] if number < len(left) else Text("")
+        line = left_lines[number] if number < len(left_lines) else Text("")
         line.truncate(width // 2 - 1, overflow="ellipsis", pad=True)
         line.append(" ")
-        line.append_text(right[number] if number < len(right) else Text(""))
+        line.append_text(right_lines[number] if number < len(right_lines) else Text(""))
         lines.append(line)
     lines.append(Text("Ctrl-C ends the run; its log is closed and judged", style="dim"))
     for line in lines:
@@ -164,9 +164,9 @@ def _draw_title(run: LiveRun, width: int) -> Text:
 
 
 def _draw_nodes(run: LiveRun, silence: float) -> list[Text]:
-    said = {**{node: (state, _NODE_STYLES.get(state, "dim")) for node, state in run.states.items()},
-            **{node: (f"DEAD: {trouble}", "bold white on red") for node, trouble in run.troubles.items()}}
-    lines = [Text.assemble(f"{name:<18}", said[node]) for node, name in run.plan.nodes.items()]
+    texts = {**{node: (state, _NODE_STYLES.get(state, "dim")) for node, state in run.states.items()},
+             **{node: (f"DEAD: {trouble}", "bold white on red") for node, trouble in run.troubles.items()}}
+    lines = [Text.assemble(f"{name:<18}", texts[node]) for node, name in run.plan.nodes.items()]
     if silence >= 1.0 and run.cycles and not run.is_over:
         lines[0].append(f"   no new cycle in the log for {silence:.1f} s", style="yellow")
     return lines
@@ -176,17 +176,17 @@ def _draw_checks(run: LiveRun, count: int) -> list[Text]:
     """The checks: failed ones, those being measured, the last ones that passed, the next ones."""
     states = list(run.checks.values())
     words = [state.word for state in states]
-    passed, failed = words.count("PASS"), words.count("FAIL")
-    title = Text.assemble((f"Checks: {passed} pass", "bold"), (f", {failed} fail", "bold red" if failed else "bold"),
-                          (f" of {len(states)}", "bold"))
-    shown = [state for word in _STYLES for state in states if state.word == word]
+    passes, failures = words.count("PASS"), words.count("FAIL")
+    title = Text.assemble((f"Checks: {passes} pass", "bold"),
+                          (f", {failures} fail", "bold red" if failures else "bold"), (f" of {len(states)}", "bold"))
+    visible_states = [state for word in _STYLES for state in states if state.word == word]
     done = [state for state in states if state.word == "PASS"]
     room = count - 1 - sum(word in ("FAIL", "CANNOT_TELL", "measures") for word in words)
-    if len(shown) > count - 1:  # the newest of those that passed
+    if len(visible_states) > count - 1:  # the newest of those that passed
         keep = done[len(done) - max(min(room - 1, len(done)), 0):]
-        shown = [state for state in shown if state.word != "PASS" or state in keep]
+        visible_states = [state for state in visible_states if state.word != "PASS" or state in keep]
     return [title, *(Text.assemble((f"{state.word:<8} ", _STYLES[state.word]), state.name, (state.measured, "bold"))
-                     for state in shown[:count - 1])]
+                     for state in visible_states[:count - 1])]
 
 
 def _draw_timing(run: LiveRun) -> list[Text]:
@@ -203,11 +203,11 @@ def _describe_lateness(run: LiveRun) -> str:
 
 
 def _describe_spread(values: NDArray[np.float64]) -> str:
-    known = values[~np.isnan(values)] * 1e6
-    if not len(known):
+    microseconds = values[~np.isnan(values)] * 1e6
+    if not len(microseconds):
         return "unknown"
-    p50, p99 = np.percentile(known, (50, 99))
-    return f"p50 {p50:.0f} p99 {p99:.0f} max {known.max():.0f} us"
+    p50, p99 = np.percentile(microseconds, (50, 99))
+    return f"p50 {p50:.0f} p99 {p99:.0f} max {microseconds.max():.0f} us"
 
 
 def _draw_events(run: LiveRun, count: int) -> list[Text]:
@@ -231,8 +231,8 @@ def draw_plot(lines: dict[str, NDArray[np.float64]], width: int, height: int, sm
         smallest_range: of the axis, so that noise does not fill the screen.
     """
     columns = max(width - 8, 1)
-    known = np.concatenate([values[~np.isnan(values)] for values in lines.values()])
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    finite_values = np.concatenate([values[~np.isnan(values)] for values in lines.values()])
+    low, high = (float(finite_values.min()), float(finite_values.max())) if len(finite_values) else (0.0, 0.0)
     margin = max(smallest_range - (high - low), 0.1 * (high - low)) / 2
     low, high = low - margin, high + margin
     bits = np.zeros((height, columns), int)
@@ -384,11 +384,11 @@ def show_on_terminal(log: Path, plan: LivePlan) -> None:
         print_lines(log, run)
         return
     with Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
-        last, heard = -1, time.monotonic()
+        last, last_change = -1, time.monotonic()
         for _ in follow_run(log, run):
             if run.cycles != last:
-                last, heard = run.cycles, time.monotonic()
-            live.update(draw_screen(run, *console.size, time.monotonic() - heard), refresh=True)
+                last, last_change = run.cycles, time.monotonic()
+            live.update(draw_screen(run, *console.size, time.monotonic() - last_change), refresh=True)
 
 
 def find_obstacle(console: Console) -> str:

@@ -178,9 +178,9 @@ def build_blueprint(drawing: Drawing, play_state: Literal["paused", "following"]
     title, _ = drawing.document
     text: Any = rrb.TextDocumentView(origin=f"/log/{title.lower()}", name=title)
     if drawing.log is not None:
-        shown = rrb.TextLogColumns(timeline_columns=[TimelineColumn(TIMELINE, visible=False)],
-                                   text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")])
-        text = rrb.Tabs(rrb.TextLogView(contents=["/log/events", "/log/checks"], name=TEXTS, columns=shown), text)
+        log_columns = rrb.TextLogColumns(timeline_columns=[TimelineColumn(TIMELINE, visible=False)],
+                                         text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")])
+        text = rrb.Tabs(rrb.TextLogView(contents=["/log/events", "/log/checks"], name=TEXTS, columns=log_columns), text)
     below = rrb.Horizontal(view_lanes(drawing.lanes_title, [*dict.fromkeys(others)]), text)
     height = min(max((75 + 40 * len(others)) / 1080, 0.3), 0.45)  # a lane has 40 of the window's 1080 pixels
     window = rrb.Vertical(rrb.Horizontal(*columns, column_shares=shares), below,
@@ -196,12 +196,12 @@ def _choose_axis(plot: Plot) -> Any:
     """
     import rerun.blueprint as rrb
 
-    known = [found for curve in plot.curves if len(found := curve.values[~np.isnan(curve.values)])]
-    if not known:
+    numbers = [values for curve in plot.curves if len(values := curve.values[~np.isnan(curve.values)])]
+    if not numbers:
         return None
     if plot.origin == "timing":
-        return rrb.ScalarAxis(range=(0.0, 1.5 * max(float(np.percentile(values, 99.5)) for values in known)))
-    wider = widen_range(min(float(values.min()) for values in known), max(float(values.max()) for values in known))
+        return rrb.ScalarAxis(range=(0.0, 1.5 * max(float(np.percentile(values, 99.5)) for values in numbers)))
+    wider = widen_range(min(float(values.min()) for values in numbers), max(float(values.max()) for values in numbers))
     return rrb.ScalarAxis(range=wider) if wider else None
 
 
@@ -416,33 +416,35 @@ REFERENCE, NOISE = COMMAND, 0x7FD46BFF
 COLOURS = (0xE8A33DFF, 0xD96BA0FF, 0x45B8ACFF, 0xB57EDCFF, 0x3D8FE0FF)  # of the runs after the first, in rotation
 
 
-def draw_runs(found: RunDifferences) -> Drawing:
+def draw_runs(differences: RunDifferences) -> Drawing:
     """Draw runs and their differences, on the time of the first run: two plots for each signal, below each other."""
     plots: list[Plot] = []
-    for name, (size, unit) in choose_difference_units(found).items():
-        signal = found.runs[0].trace.declared.find(name)
-        plots += [Plot(name, label_signal(signal), _draw_signal(found, name, signal.shown_scale)),
+    for name, (size, unit) in choose_difference_units(differences).items():
+        signal = differences.runs[0].trace.declared.find(name)
+        plots += [Plot(name, label_signal(signal), _draw_signal(differences, name, signal.shown_scale)),
                   Plot(f"difference_{name}", f"{signal.symbol} minus that of A [{unit}]",
-                       _draw_difference(found, name, 1.0 / size))]
-    return Drawing(join_words([run.source for run in found.runs]), plots, "Runs", [*_list_lanes_of_runs(found)],
-                   ("Result", format_document(build_diff_report(found))), verdict=found.verdict)
+                       _draw_difference(differences, name, 1.0 / size))]
+    return Drawing(join_words([run.source for run in differences.runs]), plots, "Runs",
+                   [*_list_lanes_of_runs(differences)], ("Result", format_document(build_diff_report(differences))),
+                   verdict=differences.verdict)
 
 
-def _draw_signal(found: RunDifferences, name: str, scale: float) -> list[Curve]:
-    offsets = [0.0, *(pair.offset for pair in found.pairs)]
+def _draw_signal(differences: RunDifferences, name: str, scale: float) -> list[Curve]:
+    offsets = [0.0, *(pair.offset for pair in differences.pairs)]
     return [Curve(f"{number:02}_{run.label}", f"{run.label} {_shorten_source(run)}", _choose_colour(number),
                   run.trace.t + offset, run.trace.column(name) * scale, 1.5 if number else 4.0)
-            for number, (run, offset) in enumerate(zip(found.runs, offsets, strict=True)) if name in run.trace.signals]
+            for number, (run, offset) in enumerate(zip(differences.runs, offsets, strict=True))
+            if name in run.trace.signals]
 
 
-def _draw_difference(found: RunDifferences, name: str, scale: float) -> list[Curve]:
-    known = [(number, pair, signal) for number, pair in enumerate(found.pairs, 1) for signal in pair.signals
+def _draw_difference(differences: RunDifferences, name: str, scale: float) -> list[Curve]:
+    pairs = [(number, pair, signal) for number, pair in enumerate(differences.pairs, 1) for signal in pair.signals
              if signal.name == name]
     curves = [Curve(f"{number:02}_{pair.run.label}", f"{pair.run.label} - A", _choose_colour(number), pair.t,
-                    pair.differences[name] * scale) for number, pair, _ in known]
-    band = max((NOISE_BAND_RATIO * math.hypot(*signal.noise) * scale for _, _, signal in known), default=0.0)
+                    pair.differences[name] * scale) for number, pair, _ in pairs]
+    band = max((NOISE_BAND_RATIO * math.hypot(*signal.noise) * scale for _, _, signal in pairs), default=0.0)
     return curves + [Curve(f"noise_{side}", f"noise of both runs, {NOISE_BAND_RATIO:g} SD", NOISE,
-                           found.runs[0].trace.t[[0, -1]], np.full(2, sign * band))
+                           differences.runs[0].trace.t[[0, -1]], np.full(2, sign * band))
                      for side, sign in (("high", 1.0), ("low", -1.0))]
 
 
@@ -460,9 +462,9 @@ def _shorten_source(run: Run) -> str:
     return path.parent.name or path.name if path.name == "trace.mcap" else path.name
 
 
-def _list_lanes_of_runs(found: RunDifferences) -> Iterator[Lane]:
+def _list_lanes_of_runs(differences: RunDifferences) -> Iterator[Lane]:
     """Verdict and faults of each run, and the command of each run that has another one than the first."""
-    for run, pair in zip(found.runs, [None, *found.pairs], strict=True):
+    for run, pair in zip(differences.runs, [None, *differences.pairs], strict=True):
         offset = pair.offset if pair else 0.0
         yield from list_verdict_lanes(run.trace, run.label, offset)
         if pair is None or not pair.has_same_command:
@@ -479,12 +481,12 @@ NOT_JUDGED = "not judged"
 def draw_comparison(c: Comparison, before: Comparison | None) -> Drawing:
     """Draw a comparison, and that with the model before a change: two plots for each signal, below each other."""
     models = ([("before", before)] if before else []) + [("model", c)]
-    plots = [draw(name, [(word, found) for word, found in models if name in found.signals])
+    plots = [draw(name, [(word, comparison) for word, comparison in models if name in comparison.signals])
              for name in c.signals for draw in (_draw_replay, _draw_residual)]
-    lanes = [make_command_lane(c.trace, "run", 0.0), *(_make_error_lane(word, found) for word, found in models),
-             *_list_left_out(c)]
-    was = f"\n\nBefore the change:\n\n{format_document(build_comparison_report(before))}" if before else ""
-    text = format_document(build_comparison_report(c)) + was
+    lanes = [make_command_lane(c.trace, "run", 0.0),
+             *(_make_error_lane(word, comparison) for word, comparison in models), *_list_left_out(c)]
+    text_before = f"\n\nBefore the change:\n\n{format_document(build_comparison_report(before))}" if before else ""
+    text = format_document(build_comparison_report(c)) + text_before
     return Drawing(f"{c.source}, {c.model.name}", plots, "Command and error", lanes, ("Result", text),
                    verdict=c.verdict)
 
@@ -498,20 +500,20 @@ def _draw_replay(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
     return Plot(name, label_signal(signal), [
         Curve("1_measured", f"{signal.symbol} measured", COMMAND, trace.t, trace.mask_unusable(name) * scale, 4.0),
         *(Curve(f"{number}_{word}", "before the change" if word == "before" else model,
-                BEFORE if word == "before" else colour, found.trace.t, found.replay.model[name] * scale)
-          for number, (word, found) in enumerate(models, 2))])
+                BEFORE if word == "before" else colour, comparison.trace.t, comparison.replay.model[name] * scale)
+          for number, (word, comparison) in enumerate(models, 2))])
 
 
 def _draw_residual(name: str, models: Sequence[tuple[str, Comparison]]) -> Plot:
     """Measured minus model, and the band of the noise floor."""
     last = models[-1][1]
     signal, colour = last.signals[name].signal, RESIDUALS[last.trace.output_names.index(name) % len(RESIDUALS)]
-    unit, scale = choose_drawn_unit(signal, max(found.signals[name].error for _, found in models))
+    unit, scale = choose_drawn_unit(signal, max(comparison.signals[name].error for _, comparison in models))
     floor = NOISE_BAND_RATIO * last.signals[name].floor.value * scale
     return Plot(f"residual_{name}", f"Residual of {signal.symbol}, measured minus model [{unit}]", [
         *(Curve(f"{number}_{word}", "before the change" if word == "before" else "residual",
-                BEFORE if word == "before" else colour, found.trace.t, found.replay.residual[name] * scale)
-          for number, (word, found) in enumerate(models, 1)),
+                BEFORE if word == "before" else colour, comparison.trace.t, comparison.replay.residual[name] * scale)
+          for number, (word, comparison) in enumerate(models, 1)),
         *(Curve(f"3_floor_{side}", f"noise floor, {NOISE_BAND_RATIO:g} SD", FLOOR, last.trace.t[[0, -1]],
                 np.full(2, sign * floor)) for side, sign in (("high", 1.0), ("low", -1.0)))])
 

@@ -153,8 +153,8 @@ def _draw_views(viewer: subprocess.Popen[bytes], url: str, image: Path, patience
     time.sleep(7.0)  # the viewer's own greeting covers a corner for that long
     client, deadline, before = ViewerClient(url), time.monotonic() + patience, b""
     client.save_screenshot(str(image.resolve()))
-    while (drawn := image.read_bytes()) != before and time.monotonic() < deadline:
-        before = drawn
+    while (picture := image.read_bytes()) != before and time.monotonic() < deadline:
+        before = picture
         time.sleep(3.0)
         client.save_screenshot(str(image.resolve()))
     return list(client.get_state().views)
