@@ -22,21 +22,21 @@ def build_bill(created: str) -> dict[str, Any]:
 
     `created`: time in UTC, ISO 8601.
     """
-    found: dict[str, Distribution] = {}
+    packages: dict[str, Distribution] = {}
     needs: dict[str, list[str]] = {}
     waiting = [ROOT]
     while waiting:
         name = waiting.pop()
-        if name in found:
+        if name in packages:
             continue
         try:
-            found[name] = distribution(name)
+            packages[name] = distribution(name)
         except PackageNotFoundError:  # of an extra that is not installed, or for another system
             continue
-        needs[name] = sorted({_normalise(text) for text in found[name].requires or ()
+        needs[name] = sorted({_normalise(text) for text in packages[name].requires or ()
                               if name == ROOT or "extra ==" not in text})
         waiting += needs[name]
-    components = {name: _describe(name, each) for name, each in sorted(found.items())}
+    components = {name: _describe(name, each) for name, each in sorted(packages.items())}
     own = {**components.pop(ROOT, {"name": ROOT, "bom-ref": ROOT}), "type": "application"}
     python = {"type": "platform", "name": platform.python_implementation(), "version": platform.python_version(),
               "bom-ref": "python"}
@@ -55,11 +55,11 @@ def _normalise(requirement: str) -> str:
 def _describe(name: str, package: Distribution) -> dict[str, Any]:
     purl = f"pkg:pypi/{name}@{package.version}"
     component = {"type": "library", "name": name, "version": package.version, "bom-ref": purl, "purl": purl}
-    said = package.metadata.json  # its license as an expression, or in words that may be all of its text
-    if "license_expression" in said:
-        return {**component, "licenses": [{"expression": said["license_expression"]}]}
-    named = str(said.get("license", "")).splitlines()
-    return {**component, "licenses": [{"license": {"name": named[0]}}]} if len(named) == 1 else component
+    metadata = package.metadata.json  # its license as an expression, or in words that may be all of its text
+    if "license_expression" in metadata:
+        return {**component, "licenses": [{"expression": metadata["license_expression"]}]}
+    lines = str(metadata.get("license", "")).splitlines()
+    return {**component, "licenses": [{"license": {"name": lines[0]}}]} if len(lines) == 1 else component
 
 
 BILL = "sbom.cdx.json"
@@ -91,15 +91,15 @@ def collect_runs(sources: Iterable[str]) -> Package:
         InputError: a folder without a run, or a run whose verdict.json is not what its log says.
     """
     package = Package([], [], {}, {})
-    taken: set[str] = set()
+    bases: set[str] = set()
     for source in map(Path, sources):
         root = source.parent if source.name == "trace.mcap" else source
         verdicts = sorted(root.rglob("verdict.json"))
         require(verdicts, source, "", "the folder of a run or suite, with the verdict.json of a run in it")
         stem = root.resolve().name
-        base = next(name for number in range(1, len(taken) + 2)
-                    if (name := stem if number == 1 else f"{stem}-{number}") not in taken)
-        taken.add(base)
+        base = next(name for number in range(1, len(bases) + 2)
+                    if (name := stem if number == 1 else f"{stem}-{number}") not in bases)
+        bases.add(base)
         package.files.update({f"runs/{base}/{file.relative_to(root).as_posix()}": file
                               for file in sorted(root.rglob("*")) if file.is_file() and not file.is_symlink()})
         cases = _read_suite(root / "suite.json", base, package) if (root / "suite.json").is_file() else {}
@@ -107,7 +107,8 @@ def collect_runs(sources: Iterable[str]) -> Package:
             name = Path(base, file.parent.relative_to(root)).as_posix()
             run = _read_run(file, name, cases.pop(file.parent.name, JudgedRun(name, "", (), ())).requirement)
             package.runs.append(run)
-            package.files.update({f"inputs/{name}/{kept}": data for kept, data in run.trace.attachments.items()})
+            package.files.update({f"inputs/{name}/{attachment}": content
+                                  for attachment, content in run.trace.attachments.items()})
         package.lost.extend(cases.values())
     return package
 
@@ -140,18 +141,18 @@ def _read_run(file: Path, name: str, requirement: tuple[str, ...]) -> PackedRun:
     trace = Trace.read(file.parent / "trace.mcap", all=True)
     try:
         answer = _read_json(file)
-        said = [(each["name"], each["value"], each["verdict"], ", ".join(each["requirement"]))
-                for each in answer["checks"]]
+        answer_rows = [(each["name"], each["value"], each["verdict"], ", ".join(each["requirement"]))
+                       for each in answer["checks"]]
         checks = [JudgedCheck(each["name"], tuple(each["requirement"]), each["verdict"]) for each in answer["checks"]
                   if each["requirement"]]
-        judged = JudgedRun(name, answer["verdict"], requirement, checks)
+        run = JudgedRun(name, answer["verdict"], requirement, checks)
     except (KeyError, TypeError) as error:
         raise InputError(file, "", f"the verdict of a run by this version ({error})") from error
-    logged = trace.provenance.get("verdict.verdict", "")
-    known = [(check.name, to_plain(check.value), check.verdict, check.requirement) for check in trace.checks]
-    require(judged.verdict == logged and said == known, file, "verdict",
-            f"what its log says, {logged or 'no verdict'}, check by check")
-    return PackedRun(answer, trace, judged)
+    log_verdict = trace.provenance.get("verdict.verdict", "")
+    log_rows = [(check.name, to_plain(check.value), check.verdict, check.requirement) for check in trace.checks]
+    require(run.verdict == log_verdict and answer_rows == log_rows, file, "verdict",
+            f"what its log says, {log_verdict or 'no verdict'}, check by check")
+    return PackedRun(answer, trace, run)
 
 
 def add_index(package: Package, requirements: Iterable[Requirement], created: str) -> dict[str, Any]:

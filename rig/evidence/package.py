@@ -133,10 +133,10 @@ def verify_package(path: Path, key: str = "") -> Verification:
             if INDEX in files or MANIFEST.encode() in start:  # the first file of a zip, whose directory is damaged
                 return Verification(0, "", "not checked", [], [MANIFEST], [])
             raise InputError(path, MANIFEST, "a package of rig evidence, which has this file")
-        found = _compare_files(path, files, key)
-        if not path.is_dir() and found.is_intact and not _is_as_written(files, path):
-            found.changed.append(f"{path.name} (the zip itself; its files are as sealed)")
-        return found
+        verification = _compare_files(path, files, key)
+        if not path.is_dir() and verification.is_intact and not _is_as_written(files, path):
+            verification.changed.append(f"{path.name} (the zip itself; its files are as sealed)")
+        return verification
 
 
 def _read(open_file: Callable[[], IO[bytes]], most: int = -1) -> bytes:
@@ -155,17 +155,18 @@ def _compare_files(path: Path, files: Files, key: str) -> Verification:
                     f"a file of the package, not {entry[2][:200]!r}")
     for name in files:
         require(is_inside(name), path, "", f"names that stay in the package, not {show_value(name)}")
-    changed = [] if _format_manifest(hashes) == manifest else [MANIFEST]
-    changed += [name for name in sorted(hashes.keys() & files) if _compute_sha256(files[name]) != hashes[name]]
-    missing = sorted(hashes.keys() - files)
-    signature, signed = "none", [tool for tool, signer in SIGNERS.items() if signer.file in files]
-    for tool in signed:
+    changed_names = [] if _format_manifest(hashes) == manifest else [MANIFEST]
+    changed_names += [name for name in sorted(hashes.keys() & files) if _compute_sha256(files[name]) != hashes[name]]
+    missing_names = sorted(hashes.keys() - files)
+    signature, tools = "none", [tool for tool, signer in SIGNERS.items() if signer.file in files]
+    for tool in tools:
         file = SIGNERS[tool].file
         is_valid, signature = _check_signature(manifest, tool, _read(files[file]), key)
-        changed += [] if is_valid else [f"{file} ({signature})"]
-    missing += [f"a signature by {key}"] if key and not signed else []
-    added = sorted(files.keys() - hashes.keys() - {MANIFEST, *(SIGNERS[tool].file for tool in signed)})
-    return Verification(len(hashes), hashlib.sha256(manifest).hexdigest(), signature, changed, missing, added)
+        changed_names += [] if is_valid else [f"{file} ({signature})"]
+    missing_names += [f"a signature by {key}"] if key and not tools else []
+    added_names = sorted(files.keys() - hashes.keys() - {MANIFEST, *(SIGNERS[tool].file for tool in tools)})
+    return Verification(len(hashes), hashlib.sha256(manifest).hexdigest(), signature, changed_names, missing_names,
+                        added_names)
 
 
 def _format_manifest(hashes: Mapping[str, str]) -> bytes:
@@ -220,8 +221,8 @@ def _is_as_written(files: Files, path: Path) -> bool:
 def _sign(manifest: bytes, key: str) -> tuple[str, bytes]:
     """Name and content of the signature. Raises InputError for a key, or a program, that is not there."""
     tool = "minisign" if Path(key).is_file() else "gpg"
-    said, signature = _call(tool, SIGNERS[tool].sign, key, manifest, b"")
-    require(signature, "--sign", key, f"a key with which {tool} signs{_describe_absence(said)}")
+    answer, signature = _call(tool, SIGNERS[tool].sign, key, manifest, b"")
+    require(signature, "--sign", key, f"a key with which {tool} signs{_describe_absence(answer)}")
     return SIGNERS[tool].file, signature
 
 
@@ -229,19 +230,19 @@ def _check_signature(manifest: bytes, tool: str, signature: bytes, key: str) -> 
     """Whether nothing speaks against a signature, and in words what is known of it."""
     if tool == "minisign" and not key:
         return True, "by minisign, not checked: --key names the public key"
-    said, _ = _call(tool, SIGNERS[tool].verify, key, manifest, signature)
-    if not key and (said is None or "NO_PUBKEY" in said.stdout):
-        return True, f"not checked{_describe_absence(said) or ': GPG does not have the public key'}"
-    if said is None:
-        raise InputError("--key", key, f"a key of {tool}{_describe_absence(said)}")
-    signers = re.findall(r"VALIDSIG (\w+).*?(\w+)$", said.stdout, re.MULTILINE)  # of the key, and of its primary key
+    answer, _ = _call(tool, SIGNERS[tool].verify, key, manifest, signature)
+    if not key and (answer is None or "NO_PUBKEY" in answer.stdout):
+        return True, f"not checked{_describe_absence(answer) or ': GPG does not have the public key'}"
+    if answer is None:
+        raise InputError("--key", key, f"a key of {tool}{_describe_absence(answer)}")
+    signers = re.findall(r"VALIDSIG (\w+).*?(\w+)$", answer.stdout, re.MULTILINE)  # of the key, and of its primary key
     is_own = tool == "minisign" or any(each.endswith(key.replace(" ", "").upper()) for pair in signers for each in pair)
-    is_valid = said.returncode == 0 and is_own
+    is_valid = answer.returncode == 0 and is_own
     return is_valid, f"valid, by {key or signers[0][-1]}" if is_valid else f"not a valid signature by {key or 'a key'}"
 
 
-def _describe_absence(said: object) -> str:
-    return ", but this program is not installed" if said is None else ""
+def _describe_absence(answer: object) -> str:
+    return ", but this program is not installed" if answer is None else ""
 
 
 def _call(tool: str, arguments: str, key: str, manifest: bytes,
@@ -254,9 +255,9 @@ def _call(tool: str, arguments: str, key: str, manifest: bytes,
                 Path(places[file]).write_bytes(content)
         output = subprocess.PIPE if signature else 2  # it may ask for a passphrase
         try:
-            said = subprocess.run([tool, *(word.format(**places) for word in arguments.split())], stdout=output,
-                                  stderr=subprocess.PIPE, text=True, check=False)
+            answer = subprocess.run([tool, *(word.format(**places) for word in arguments.split())], stdout=output,
+                                    stderr=subprocess.PIPE, text=True, check=False)
         except FileNotFoundError:
             return None, b""
-        made = Path(places["signature"])
-        return said, made.read_bytes() if made.is_file() else b""
+        signature_file = Path(places["signature"])
+        return answer, signature_file.read_bytes() if signature_file.is_file() else b""

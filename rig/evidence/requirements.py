@@ -62,28 +62,28 @@ class Requirement(NamedTuple):
                 "checks": [evidence._asdict() for evidence in self.evidence]}
 
 
-def trace_requirements(runs: Iterable[JudgedRun], listed: Mapping[str, str]) -> list[Requirement]:
+def trace_requirements(runs: Iterable[JudgedRun], requirements: Mapping[str, str]) -> list[Requirement]:
     """All requirements: those that are listed, in their order, then others that a check or run names."""
-    found: dict[str, list[Evidence]] = {name: [] for name in listed}
+    evidence_by_id: dict[str, list[Evidence]] = {name: [] for name in requirements}
     for run in runs:
         for name in run.requirement:
             verdict = {"PASS": "PASS", "FAIL": "FAIL", "ABORTED": "FAIL"}.get(run.verdict, "OPEN")
-            found.setdefault(name, []).append(Evidence(run.name, RUN, verdict))
+            evidence_by_id.setdefault(name, []).append(Evidence(run.name, RUN, verdict))
         proves_nothing = run.verdict in ("INVALID_TIMING", *NO_VERDICT)  # the bench was late, or there was no run
         for check in run.checks:
             verdict = "OPEN" if proves_nothing or check.verdict not in ("PASS", "FAIL") else check.verdict
             for name in check.requirement:
-                found.setdefault(name, []).append(Evidence(run.name, check.name, verdict))
-    return [Requirement(name, listed.get(name, ""), tuple(evidence)) for name, evidence in found.items()]
+                evidence_by_id.setdefault(name, []).append(Evidence(run.name, check.name, verdict))
+    return [Requirement(name, requirements.get(name, ""), tuple(evidence)) for name, evidence in evidence_by_id.items()]
 
 
-def require_listed(runs: Iterable[JudgedRun], listed: Mapping[str, str], file: object) -> None:
+def require_listed(runs: Iterable[JudgedRun], requirements: Mapping[str, str], file: object) -> None:
     """Refuse a requirement that a check or run names and the file does not list. Raises InputError."""
     for run in runs:
         for check in (JudgedCheck(RUN, run.requirement), *run.checks):
             for name in check.requirement:
-                require(name in listed, run.name, f"requirement of {check.name!r}",
-                        f"an id of {file}, not {name!r}{suggest_name(name, listed)}")
+                require(name in requirements, run.name, f"requirement of {check.name!r}",
+                        f"an id of {file}, not {name!r}{suggest_name(name, requirements)}")
 
 
 def tabulate_requirements(requirements: Sequence[Requirement]) -> list[Table]:
@@ -120,13 +120,13 @@ def read_requirements(path: Path) -> dict[str, str]:
     """
     readers = {".csv": _read_csv, ".reqif": _read_reqif, ".xml": _read_reqif}
     require(path.suffix.lower() in readers, path, "", "a .csv or .reqif file with requirements")
-    found: dict[str, str] = {}
+    requirements: dict[str, str] = {}
     for place, name, text in readers[path.suffix.lower()](decode_text(read_file(path), path), path):
-        require(name and name.isprintable() and name not in found, place, "id",
+        require(name and name.isprintable() and name not in requirements, place, "id",
                 f"an id in one line, used once, not {name[:80]!r}")
-        found[name] = " ".join(text.split())
-    require(found, path, "", "at least one requirement")
-    return found
+        requirements[name] = " ".join(text.split())
+    require(requirements, path, "", "at least one requirement")
+    return requirements
 
 
 def _read_csv(text: str, path: Path) -> Iterator[tuple[str, str, str]]:
@@ -136,12 +136,12 @@ def _read_csv(text: str, path: Path) -> Iterator[tuple[str, str, str]]:
     rows = csv.DictReader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=first.count), strict=True)
     try:
         columns = {name.strip().lower(): name for name in rows.fieldnames or ()}
-        key = next((columns[name] for name in _ID_COLUMNS if name in columns), None)
-        if key is None:
+        id_column = next((columns[name] for name in _ID_COLUMNS if name in columns), None)
+        if id_column is None:
             raise InputError(f"{path}:1", "", f"a column with ids, one of {', '.join(_ID_COLUMNS)}")
-        told = next((columns[name] for name in _TEXT_COLUMNS if name in columns), None)
+        text_column = next((columns[name] for name in _TEXT_COLUMNS if name in columns), None)
         for row in rows:
-            yield f"{path}:{rows.line_num}", (row[key] or "").strip(), row.get(told or "") or ""
+            yield f"{path}:{rows.line_num}", (row[id_column] or "").strip(), row.get(text_column or "") or ""
     except csv.Error as error:
         raise InputError(f"{path}:{rows.line_num}", "", f"CSV ({error})") from error
 
@@ -161,8 +161,8 @@ def _read_reqif(text: str, path: Path) -> Iterator[tuple[str, str, str]]:
         for value in thing.iterfind(f"{_REQIF}VALUES/*"):
             reference = value.find(f"{_REQIF}DEFINITION/*")
             content = value.find(f"{_REQIF}THE-VALUE")
-            said = value.get("THE-VALUE", "") if content is None else "".join(content.itertext())
-            values[names.get((reference.text or "").strip() if reference is not None else "", "")] = said.strip()
+            attribute = value.get("THE-VALUE", "") if content is None else "".join(content.itertext())
+            values[names.get((reference.text or "").strip() if reference is not None else "", "")] = attribute.strip()
         if not values.get("ReqIF.ChapterName"):
             name = (values.get("ReqIF.ForeignID") or values.get("ID") or thing.get("LONG-NAME")
                     or thing.get("IDENTIFIER"))
