@@ -137,34 +137,34 @@ def make_dry_run(job: Job) -> DryRun:
     load[first:last] = sequence.load_profile()
     rate = sequence.rate
     t = (np.arange(len(command)) - first) / rate
-    predicted = simulate(model, command, load, job.seed)
-    diverged = find_divergence(model, predicted._asdict())
+    prediction = simulate(model, command, load, job.seed)
+    diverged = find_divergence(model, prediction._asdict())
     require(not diverged, model.name, "", f"a plant that stays finite; {diverged}, counted from the start of set-up")
     signals = model.kind.signals
     columns = make_columns_type(signals)(np.arange(last - first) / rate,
-                                         *(column[first:last] for column in predicted[1:]))
+                                         *(column[first:last] for column in prediction[1:]))
     run = RunData(columns, sequence.sections(), starts=sequence.fault_starts(), rate=rate, signals=signals)
     checks = [check.judge(run) for check in sequence.checks if check.kind not in OF_EVENTS]
     events = [Event(at, "INFO", "fault", f"{fault.name} {word}") for fault in faults
               for at, word in ((fault.t0, "begins"), (fault.t1, "ends"))]
-    trace = replace(Trace.from_columns(predicted._asdict(), 1 / rate, {}, signals), t=t, checks=tuple(checks),
+    trace = replace(Trace.from_columns(prediction._asdict(), 1 / rate, {}, signals), t=t, checks=tuple(checks),
                     phase=np.searchsorted((first, last), np.arange(len(t)), side="right"), events=tuple(events))
     return DryRun(
         job=job, durations={phase: len(profile.command) / rate for phase, profile in phases.items()},
         demands=measure_demands(command, load, t, name_rows(phases), model, rate), faults=faults, predicted=trace,
-        limits=find_limits(lambda name: getattr(predicted, name), model, first), checks=checks,
+        limits=find_limits(lambda name: getattr(prediction, name), model, first), checks=checks,
         not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],
         trips=[] if sequence.faults else [*find_trips(sequence.guards, run)])
 
 
 def name_rows(phases: Mapping[str, Profile]) -> list[tuple[int, str]]:
     """First row of each section of setup, main and cleanup, and its name."""
-    found, start = [], 0
+    sections, start = [], 0
     for phase, profile in phases.items():
-        found += [(start + section.start, section.name if phase == "main" else f"{phase}: {section.name}")
-                  for section in profile.sections]
+        sections += [(start + section.start, section.name if phase == "main" else f"{phase}: {section.name}")
+                     for section in profile.sections]
         start += len(profile.command)
-    return found
+    return sections
 
 
 def measure_demands(command: Array, load: Array, t: Array, sections: Sequence[tuple[int, str]],
@@ -180,7 +180,7 @@ def measure_demands(command: Array, load: Array, t: Array, sections: Sequence[tu
     acceleration = np.where(is_known, np.diff(speed, prepend=0.0) * rate, 0.0)
     limits, signals = find_capabilities(model), model.kind.signals
     unit, shown = signals.command.unit, (signals.command.shown_unit, signals.command.shown_scale)
-    moved = "position" if unit == "m" else signals.controlled.phrase
+    motion_name = "position" if unit == "m" else signals.controlled.phrase
 
     def find(name: str, values: Array, unit: str, shown: tuple[str, float], parameter: str, back: int = 0) -> Demand:
         row = int(np.argmax(np.abs(values)))
@@ -188,7 +188,7 @@ def measure_demands(command: Array, load: Array, t: Array, sections: Sequence[tu
         return Demand(name, float(np.abs(values[row])), unit, shown, float(t[row]), section, limits.get(parameter),
                       parameter)
 
-    return [find(moved, command, unit, shown, signals.controlled.limit), find("step", jumps, unit, shown, ""),
+    return [find(motion_name, command, unit, shown, signals.controlled.limit), find("step", jumps, unit, shown, ""),
             # from the row before, which may be another section's
             find("speed", speed, f"{unit}/s", (f"{shown[0]}/s", shown[1]), "no-load speed", back=1),
             find("acceleration", acceleration, f"{unit}/s2", (f"{unit}/s2", 1.0), ""),
@@ -216,20 +216,20 @@ def find_capabilities(model: Model) -> dict[str, float]:
     supply pressure on that area, PSR AJ (physics.md).
     """
     values, limit = model.values, model.kind.signals.controlled.limit
-    found = {limit: values[limit]} if limit else {}
+    capabilities = {limit: values[limit]} if limit else {}
     if {"valve.flow_gain", "spool.travel"} <= values.keys():
-        found |= {"no-load speed": model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"],
-                  "stall force": model["supply.pressure"] * model["jack.area"]}
-    return found
+        capabilities |= {"no-load speed": model["valve.flow_gain"] * model["spool.travel"] / model["jack.area"],
+                         "stall force": model["supply.pressure"] * model["jack.area"]}
+    return capabilities
 
 
 def find_trips(guards: Sequence[Guard], run: RunData) -> Iterator[tuple[str, float]]:
     """The guards that the predicted main phase violates, and when, s."""
     for guard in guards:
         watch, values = GuardWatch([guard]), run.read_signal(guard.signal, slice(0, len(run.trace.t))).tolist()
-        passed = [watch.find_passed({guard.signal: value}) is not None for value in values]
-        if any(passed):
-            yield guard.name, float(run.trace.t[passed.index(True)])
+        is_violated = [watch.find_passed({guard.signal: value}) is not None for value in values]
+        if any(is_violated):
+            yield guard.name, float(run.trace.t[is_violated.index(True)])
 
 
 def plan_faults(job: Job) -> list[PlannedFault]:
@@ -303,14 +303,14 @@ def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> 
              ("checks", str(len(sequence.checks))), ("guards", str(len(sequence.guards))),
              *([("steps in Python", ", ".join(f"{step.python} {step.when}" for step in sequence.steps))]
                if sequence.steps else [])]
-    shown = {section.title: section for section in build_run_report(dry.predicted).sections}
+    run_sections = {section.title: section for section in build_run_report(dry.predicted).sections}
     return Report(
         command="check", title=f"Dry run: {sequence.title}", verdict=data["verdict"],
         mood="bad" if problems else "good", sentence=sentence, facts=facts, notes=_list_notes(dry),
         sections=[Section("Command and load", [Line("duration", duration), *_tabulate_demands(dry.demands)]),
                   Section("Faults", _tabulate_faults(dry.faults)),
                   Section("Predicted run", describe_prediction(dry)),
-                  *(shown[title] for title in ("Checks", "Failed checks", "Signals"))],
+                  *(run_sections[title] for title in ("Checks", "Failed checks", "Signals"))],
         files=files, data=data)
 
 

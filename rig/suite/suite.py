@@ -160,8 +160,9 @@ def _vary(entry: CaseEntry, folder: Path, base: JobChoice) -> Iterator[Case]:
     models, benches = (_as_tuple(names) or (None,) for names in (entry.model, entry.bench))
     values = {name: _as_tuple(value) for name, value in entry.set.items()}
     effects = (*base.effects, *(folder / name for name in entry.effects))
-    for sequence, model, bench, seed, *chosen in itertools.product(sequences, models, benches, seeds, *values.values()):
-        changes: dict[str, Value] = dict(zip(values, chosen, strict=True))
+    for sequence, model, bench, seed, *settings in itertools.product(sequences, models, benches, seeds,
+                                                                     *values.values()):
+        changes: dict[str, Value] = dict(zip(values, settings, strict=True))
         words = [entry.name or Path(sequence).stem,
                  *([Path(sequence).stem] if entry.name and len(sequences) > 1 else []),
                  *(Path(file).stem for file, files in ((model, models), (bench, benches))
@@ -184,24 +185,24 @@ def build_suite(title: str, cases: Sequence[Case], requirements: Mapping[str, st
     Raises:
         InputError: a case that cannot run, or code that a model brings along and that is not trusted.
     """
-    tried: list[Case] = []
+    complete_cases: list[Case] = []
     names: set[str] = set()
     folders: set[str] = {"suite.html", "suite.json"}
     for case in cases:
         slug = re.sub(r"[^\w.=+-]+", "-", case.name).strip("-.")[:80] or "case"
         job = build_job(case.choice, is_trusted=is_trusted)
-        tried.append(case._replace(
+        complete_cases.append(case._replace(
             name=_find_free(case.name, names, " ({})"), folder=Path(_find_free(slug, folders, "-{}")),
             timeout=300.0 + 10.0 * job.sequence.duration if case.timeout is None else case.timeout,
             checks=tuple(JudgedCheck(check.name, check.requirements) for check in job.sequence.checks)))
-    return Suite(title, tried, requirements, source)
+    return Suite(title, complete_cases, requirements, source)
 
 
-def _find_free(name: str, taken: set[str], pattern: str) -> str:
+def _find_free(name: str, names: set[str], pattern: str) -> str:
     """The name, with a number from 2 if it is taken; whether letters are capitals makes no difference."""
     free = next(each for number in itertools.count(1)
-                if (each := name if number == 1 else name + pattern.format(number)).lower() not in taken)
-    taken.add(free.lower())
+                if (each := name if number == 1 else name + pattern.format(number)).lower() not in names)
+    names.add(free.lower())
     return free
 
 
@@ -250,10 +251,10 @@ class CaseResult(NamedTuple):
         """
         if self.verdict == "PASS" and self.fdi.get("verdict") == "CANNOT_TELL":
             return "rig fdi cannot tell"
-        failed = [check.name for check in self.failed]
-        if self.verdict != "FAIL" or (len(failed) < 2 and not has_fault(self.fdi)):
+        names = [check.name for check in self.failed]
+        if self.verdict != "FAIL" or (len(names) < 2 and not has_fault(self.fdi)):
             return self.why
-        reasons = (list_first(failed, 1), describe_finding(self.fdi) if has_fault(self.fdi) else "")
+        reasons = (list_first(names, 1), describe_finding(self.fdi) if has_fault(self.fdi) else "")
         return "; ".join(filter(None, reasons))
 
 
@@ -288,19 +289,19 @@ def run_cases(cases: Sequence[Case], processes: int, show: Callable[[CaseResult]
     Raises:
         RigError: a worker process cannot start.
     """
-    found: dict[str, CaseResult] = {}
+    results: dict[str, CaseResult] = {}
     is_interrupted = False
-    finished = run_in_processes(play_case, cases, processes, lambda case, reason: CaseResult(case, "ERROR", reason),
-                                attempts=1, choose_limit=lambda case: case.timeout or UNLIMITED, patience=patience)
-    with contextlib.closing(finished):  # type: ignore[type-var]  # a generator
+    pairs = run_in_processes(play_case, cases, processes, lambda case, reason: CaseResult(case, "ERROR", reason),
+                             attempts=1, choose_limit=lambda case: case.timeout or UNLIMITED, patience=patience)
+    with contextlib.closing(pairs):  # type: ignore[type-var]  # a generator
         try:
-            for case, result in finished:
-                found[case.name] = result
+            for case, result in pairs:
+                results[case.name] = result
                 show(result)
         except KeyboardInterrupt:
             is_interrupted = True
     missing = "the suite was interrupted before it had finished"
-    return [found.get(case.name) or CaseResult(case, "NOT_RUN", missing) for case in cases], is_interrupted
+    return [results.get(case.name) or CaseResult(case, "NOT_RUN", missing) for case in cases], is_interrupted
 
 
 def play_case(case: Case) -> CaseResult:
@@ -401,8 +402,8 @@ def _describe(results: Sequence[CaseResult], most: int = 3) -> str:
         unjudged = sum(result.verdict == "NOT_JUDGED" for result in results)
         without = f", {unjudged} of them without checks" if unjudged else ""
         return f"{count_nouns(len(results), 'case')}, none failed{without}."
-    named = list_first([result.case.name for result in bad], most)
-    return f"{len(bad)} of {count_nouns(len(results), 'case')} did not pass: {named}."
+    names = list_first([result.case.name for result in bad], most)
+    return f"{len(bad)} of {count_nouns(len(results), 'case')} did not pass: {names}."
 
 
 def _tabulate_cases(results: Sequence[CaseResult], folder: Path) -> list[Table]:
@@ -443,8 +444,8 @@ def _tabulate_faults(results: Sequence[CaseResult], folder: Path) -> list[Table]
     from fdi.report import LEVEL_MOODS, LEVEL_NAMES, VERDICT_MOODS, FoundFault, list_found_faults
 
     moods = {name: LEVEL_MOODS[level] for level, name in LEVEL_NAMES.items()}
-    rows = [(result if number == 0 else None, found) for result in results if result.fdi
-            for number, found in enumerate(list_found_faults(result.fdi) or [FoundFault("", "", "")])]
+    rows = [(result if number == 0 else None, fault) for result in results if result.fdi
+            for number, fault in enumerate(list_found_faults(result.fdi) or [FoundFault("", "", "")])]
 
     def show_verdict(result: CaseResult | None) -> Cell:
         word = result.fdi["verdict"] if result else ""
@@ -523,16 +524,16 @@ def _make_run_test(result: CaseResult, classname: str) -> junit.TestCase:
 
 
 def _make_check_test(check: CheckResult, result: CaseResult, classname: str) -> junit.TestCase:
-    measured = check.describe() + (f" ({check.detail})" if check.detail else "")
+    description = check.describe() + (f" ({check.detail})" if check.detail else "")
     window = "" if check.t0 != check.t0 else f"; window {check.t0:.3f} to {check.t1:.3f} s"
     test = junit.TestCase(check.name, classname, output="\n".join(
-        filter(None, (measured + window, _name_requirements(check.requirements)))))
+        filter(None, (description + window, _name_requirements(check.requirements)))))
     if check.passed:
         return test
     if check.cannot_tell or result.verdict in ("INVALID_TIMING", *NO_VERDICT):
         word = check.verdict if check.cannot_tell else result.verdict
-        return test._replace(problem="skipped", message=f"{word}: {measured}")
-    return test._replace(problem="failure", message=measured, detail=f"{check.kind} {check.signal}".strip() + window)
+        return test._replace(problem="skipped", message=f"{word}: {description}")
+    return test._replace(problem="failure", message=description, detail=f"{check.kind} {check.signal}".strip() + window)
 
 
 def _make_diagnosis_test(result: CaseResult, classname: str) -> junit.TestCase:
