@@ -58,14 +58,14 @@ GET_GCC = "apt-get install gcc"
 def measure_durations(works: Mapping[str, Work], rounds: int) -> dict[str, Floats]:
     """Durations of each work, (rounds,) s, after one warm-up; the rounds alternate between them."""
     clock = WallClock()
-    taken: dict[str, list[int]] = {name: [] for name in works}
+    durations: dict[str, list[int]] = {name: [] for name in works}
     for turn in range(rounds + 1):
         for name, work in works.items():
             start = clock.now()
             work()
             if turn > 0:
-                taken[name].append(clock.now() - start)
-    return {name: np.array(times) * 1e-9 for name, times in taken.items()}
+                durations[name].append(clock.now() - start)
+    return {name: np.array(times) * 1e-9 for name, times in durations.items()}
 
 
 def measure_median_duration(work: Work, rounds: int) -> float:
@@ -81,12 +81,12 @@ def find_gcc() -> str:
 def build_library(source: str, flags: tuple[str, ...], target: Path, package: str = "rig.bench") -> ctypes.CDLL:
     """A C file of a package as a library; gcc must be installed."""
     # without -std=c..., which would silently forbid the fused multiply-add
-    compiled = target.with_suffix(".o")
-    places = [f"-I{files('rig.bench')}", "-c", str(files(package) / source), "-o", str(compiled)]
+    object_file = target.with_suffix(".o")
+    places = [f"-I{files('rig.bench')}", "-c", str(files(package) / source), "-o", str(object_file)]
     subprocess.run([find_gcc(), *flags, "-fPIC", *places], check=True)
     # a library that is linked with -ffast-math switches the small numbers next to zero off for the whole process
     harmless = [flag for flag in flags if flag != "-ffast-math"]
-    subprocess.run([find_gcc(), *harmless, "-shared", str(compiled), "-o", str(target), "-lm"], check=True)
+    subprocess.run([find_gcc(), *harmless, "-shared", str(object_file), "-o", str(target), "-lm"], check=True)
     return ctypes.CDLL(str(target))
 
 
@@ -102,13 +102,13 @@ def measure_blocks(bus: str, seconds: float, blocks: int, contenders: Mapping[st
     """
     require(can_open(bus), "--bus", bus, "socketcan:INTERFACE or udp_multicast[:GROUP]")
     compile_cycle()
-    names, found = list(contenders), {name: list[Times]() for name in contenders}
+    names, times = list(contenders), {name: list[Times]() for name in contenders}
     for block in range(blocks):
         turn = block % len(names)  # nobody is always the first
         for number, name in enumerate(names[turn:] + names[:turn]):
             progress(f"block {block + 1} of {blocks}: {name}", (block + number / len(names)) / blocks)
-            found[name].append(contenders[name](seconds / blocks))
-    return found, {"bus": bus, "seconds": seconds, "blocks": blocks, "cpus": len(list_cpus()),
+            times[name].append(contenders[name](seconds / blocks))
+    return times, {"bus": bus, "seconds": seconds, "blocks": blocks, "cpus": len(list_cpus()),
                    "priority": choose_priority()}
 
 
@@ -196,8 +196,8 @@ def measure_realtime(bus: str, seconds: float, blocks: int, progress: Progress =
         InputError: a bus that compiled code cannot use.
         RigError: a bus or a node that does not work.
     """
-    found, conditions = measure_blocks(bus, seconds, blocks, list_contenders(bus), progress)
-    return summarise_contenders({name: pool_times(each) for name, each in found.items()}) | conditions | {
+    times, conditions = measure_blocks(bus, seconds, blocks, list_contenders(bus), progress)
+    return summarise_contenders({name: pool_times(each) for name, each in times.items()}) | conditions | {
         "missing": [name for name, path in (("cyclictest", find_cyclictest()), ("gcc", find_gcc())) if not path]}
 
 
@@ -238,7 +238,7 @@ def play_block(bus: str, seconds: float, peer: Peer | None = None, bench: Path |
     Raises:
         RigError: the peer does not boot.
     """
-    is_foreign, chosen = bench is not None, replace(load_bench(str(bench or "eha")), cycle_ns=1_000_000)
+    is_foreign, peer_bench = bench is not None, replace(load_bench(str(bench or "eha")), cycle_ns=1_000_000)
     history = History()
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         recorder = Recorder(Path(folder) / "trace.mcap", {}, {})
@@ -246,24 +246,24 @@ def play_block(bus: str, seconds: float, peer: Peer | None = None, bench: Path |
         clock = WallClock()
         wire = LinkWire(Link(open_can(bus), clock.now), clock)
         stack.callback(wire.close)
-        master = Master(wire, clock.now, stamped=True, bench=chosen)
-        if peer is not None and chosen.nodes:
+        master = Master(wire, clock.now, stamped=True, bench=peer_bench)
+        if peer is not None and peer_bench.nodes:
             role = Role.CONTROLLER if is_foreign else Role.PLANT
             if not any(master.is_present(role, 1.0) for _ in range(120) if peer.poll() is None):
-                raise RigError(f"{chosen.describe_node(role)} does not boot")
+                raise RigError(f"{peer_bench.describe_node(role)} does not boot")
             master.start()
         master.hooks.on_frame = recorder.frame
         log = _Log(history, recorder)
         plan = Plan(stop=0)
         scenario, faults = Scenario(Model(), plan), Schedule(plan)
-        loop = open_loop(master, chosen, scenario, faults, log, bus, True)
+        loop = open_loop(master, peer_bench, scenario, faults, log, bus, True)
         stack.callback(loop.close)
         stack.enter_context(enter_real_time(1))
         for _ in range(round(seconds * 1000)):
             loop.cycle(CycleInput(1, 0.0, 0.0, 0))
         loop.finish()
-    named = ("lateness", "execution") if is_foreign else _QUANTITIES  # its plant has no frames
-    return {name: history.column(name)[_SETTLING:].copy() for name in named}
+    quantities = ("lateness", "execution") if is_foreign else _QUANTITIES  # its plant has no frames
+    return {name: history.column(name)[_SETTLING:].copy() for name in quantities}
 
 
 class _Log:
@@ -284,11 +284,13 @@ class _Log:
 def summarise_contenders(times: Mapping[str, Times]) -> dict[str, Any]:
     """Percentiles in us by quantity and contender, lost answers, and the targets."""
     tables: dict[str, dict[str, dict[str, float]]] = {
-        quantity: {name: compute_percentiles(found[quantity]) for name, found in times.items() if quantity in found}
+        quantity: {name: compute_percentiles(columns[quantity]) for name, columns in times.items()
+                   if quantity in columns}
         for quantity in _QUANTITIES}
-    lost = {name: int(np.isnan(found["feedback_response"]).sum()) for name, found in times.items()
-            if "feedback_response" in found}
-    return {"times_us": tables, "lost": lost, "cycles": {name: len(found["lateness"]) for name, found in times.items()},
+    lost_answers = {name: int(np.isnan(columns["feedback_response"]).sum()) for name, columns in times.items()
+                    if "feedback_response" in columns}
+    return {"times_us": tables, "lost": lost_answers,
+            "cycles": {name: len(columns["lateness"]) for name, columns in times.items()},
             "targets": list_targets(tables)}
 
 
@@ -299,16 +301,16 @@ def list_targets(tables: Mapping[str, Mapping[str, Mapping[str, float]]]) -> lis
     """
     rows = [*(("lateness", name, CYCLICTEST, 1.2) for name in (COMPILED, *MAPPED) if name in tables["lateness"]),
             *((quantity, COMPILED, IN_C, 1.3) for quantity in ("feedback_response", "valve_response"))]
-    found: list[tuple[str, float | None, float, str]] = []
+    targets: list[tuple[str, float | None, float, str]] = []
     for quantity, name, rival, limit in rows:
         for share in ("p50", "p99"):
             own, other = (tables[quantity].get(each, {}).get(share) for each in (name, rival))
             ratio = own / other if own is not None and other else None
-            found.append((f"{quantity.replace('_', ' ')} {share}, {name} / {rival}", ratio, limit, ""))
-    found += [(f"execution p99.9, {name}", tables["execution"][name].get("p99_9"), 100.0, "us")
-              for name in (COMPILED, *MAPPED) if name in tables["execution"]]
+            targets.append((f"{quantity.replace('_', ' ')} {share}, {name} / {rival}", ratio, limit, ""))
+    targets += [(f"execution p99.9, {name}", tables["execution"][name].get("p99_9"), 100.0, "us")
+                for name in (COMPILED, *MAPPED) if name in tables["execution"]]
     return [{"name": name, "value": value, "limit": limit, "unit": unit,
-             "is_met": value is not None and value <= limit} for name, value, limit, unit in found]
+             "is_met": value is not None and value <= limit} for name, value, limit, unit in targets]
 
 
 def find_cyclictest() -> str:
@@ -361,11 +363,11 @@ _TITLES = {
 
 def build_realtime_report(figures: Mapping[str, Any]) -> Report:
     """Report on the figures of `rig.bench.benchmarks.measure_realtime`, which are its `data`."""
-    met = sum(target["is_met"] for target in figures["targets"])
+    met_count = sum(target["is_met"] for target in figures["targets"])
     get = {"cyclictest": "apt-get install rt-tests", "gcc": GET_GCC}
     return Report(
         command="bench", title="realtime",
-        sentence=f"{met} of {len(figures['targets'])} targets are met on {figures['bus']}.",
+        sentence=f"{met_count} of {len(figures['targets'])} targets are met on {figures['bus']}.",
         sections=[Section("Targets", _tabulate_targets(figures["targets"])),
                   *(Section(title, _tabulate_times(figures["times_us"][quantity], _NAMES[quantity], caption))
                     for quantity, (title, caption) in _TITLES.items()),
@@ -380,8 +382,8 @@ def build_realtime_report(figures: Mapping[str, Any]) -> Report:
 
 def _tabulate_targets(targets: Sequence[Mapping[str, Any]]) -> list[Table]:
     def judge(target: Mapping[str, Any]) -> Cell:
-        failed = "not measured" if target["value"] is None else "NOT met"
-        return Cell("met", "good") if target["is_met"] else Cell(failed, "bad")
+        failure = "not measured" if target["value"] is None else "NOT met"
+        return Cell("met", "good") if target["is_met"] else Cell(failure, "bad")
 
     return [tabulate(
         targets,
