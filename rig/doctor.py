@@ -53,23 +53,23 @@ def _grade(area: str, name: str, is_enough: bool, value: str, purpose: str, reme
 
 def read_requirements() -> dict[str, list[str]]:
     """The project's declared dependencies by extra ('' for the plain ones): names only."""
-    named: dict[str, list[str]] = {"": []}
+    names: dict[str, list[str]] = {"": []}
     for line in metadata.requires("eha-rig") or []:
         requirement, _, marker = line.partition(";")
         name = requirement.strip().split("<")[0].split(">")[0].split("=")[0].split("!")[0].split("[")[0].strip()
-        named.setdefault(marker.partition("==")[2].strip().strip("\"'"), []).append(name)
-    return named
+        names.setdefault(marker.partition("==")[2].strip().strip("\"'"), []).append(name)
+    return names
 
 
 def read_versions(names: list[str]) -> dict[str, str]:
     """Installed version of each distribution; empty if it is not installed."""
-    found = {}
+    versions = {}
     for name in names:
         try:
-            found[name] = metadata.version(name)
+            versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = ""
-    return found
+            versions[name] = ""
+    return versions
 
 
 def examine_python() -> Iterator[Finding]:
@@ -82,9 +82,9 @@ def examine_python() -> Iterator[Finding]:
               "measure": "rig import of MDF and Parquet", "learn": "comparators of rig fdi", "docs": "make docs",
               "bench": "rivals of rig bench"}
     for extra, names in read_requirements().items():
-        found = read_versions(names)
-        absent = [name for name, installed in found.items() if not installed]
-        text = "" if absent else ", ".join(f"{name} {installed}" for name, installed in found.items())
+        versions = read_versions(names)
+        absent = [name for name, installed in versions.items() if not installed]
+        text = "" if absent else ", ".join(f"{name} {installed}" for name, installed in versions.items())
         finding = _find("python", f"packages: {extra}" if extra else "packages", text, extras.get(extra, extra),
                         f"pip install 'eha-rig[{extra}]'" if extra else "pip install eha-rig", needed=not extra)
         yield finding._replace(found="missing: " + ", ".join(absent)) if absent else finding
@@ -194,30 +194,30 @@ def count_frames(bench: Bench, frames: Iterable[Frame]) -> tuple[dict[str, Count
     """How many of each frame of the bench are among `frames`, by length in bytes; the identifiers of the others."""
     loads = list_loads(bench)
     services = {each.identifier: each.name for each in loads[len(bench.frames.frames):]}  # SYNC, heartbeats
-    heard, others = {each.name: Counter[int]() for each in loads}, Counter[str]()
+    counts, others = {each.name: Counter[int]() for each in loads}, Counter[str]()
     for frame in frames:
         spec = bench.frames.find(frame.cob_id, frame.data)
         name = services.get(frame.cob_id) if spec is None else spec.name
         if name is None:
             others[describe_identifier(frame.cob_id)] += 1
         else:
-            heard[name][len(frame.data)] += 1
-    return heard, others
+            counts[name][len(frame.data)] += 1
+    return counts, others
 
 
-def judge_frames(bench: Bench, heard: dict[str, Counter[int]], others: Counter[str], seconds: float
+def judge_frames(bench: Bench, counts: dict[str, Counter[int]], others: Counter[str], seconds: float
                  ) -> Iterator[Finding]:
     """Which frames of a bench were heard within `seconds`."""
     loads = list_loads(bench)
-    reached = {load.direction.split()[0] for load in loads if heard[load.name]}  # whose power and wiring are right
+    reached = {load.direction.split()[0] for load in loads if counts[load.name]}  # whose power and wiring are right
     for load in loads:
-        received, is_ours = heard[load.name].total(), load.direction.startswith("rig")
-        wrong = sorted(length for length in heard[load.name] if length != load.length)
-        status: Status = "limited" if wrong or (is_ours and received) else "ok"
-        text = f"{received} frames in {seconds:g} s" if received or not is_ours else "none; the rig sends it"
+        frame_count, is_ours = counts[load.name].total(), load.direction.startswith("rig")
+        wrong = sorted(length for length in counts[load.name] if length != load.length)
+        status: Status = "limited" if wrong or (is_ours and frame_count) else "ok"
+        text = f"{frame_count} frames in {seconds:g} s" if frame_count or not is_ours else "none; the rig sends it"
         text += f", some of {' and '.join(map(str, wrong))} bytes, not {load.length}" if wrong else ""
-        remedy = "another rig is on the bus; end it" if is_ours and received else ""
-        if not received and not is_ours:
+        remedy = "another rig is on the bus; end it" if is_ours and frame_count else ""
+        if not frame_count and not is_ours:
             causes = [] if load.direction.split()[0] in reached else ["power, wiring, bit rate"]
             if load.name.startswith("heartbeat"):
                 causes.append("some devices send it when the rig has set 0x1017")
@@ -228,8 +228,8 @@ def judge_frames(bench: Bench, heard: dict[str, Counter[int]], others: Counter[s
         yield Finding(bench.name, f"{load.name} {describe_identifier(load.identifier)}", status, text,
                       f"{load.direction}, every {1000 * load.period:g} ms", remedy)
     if others:
-        shown = ", ".join(f"{name} ({count})" for name, count in sorted(others.items())[:8])
-        yield Finding(bench.name, "other frames", "ok", shown, "not of this bench")
+        listing = ", ".join(f"{name} ({count})" for name, count in sorted(others.items())[:8])
+        yield Finding(bench.name, "other frames", "ok", listing, "not of this bench")
 
 
 def _read_text(path: str) -> str:

@@ -32,11 +32,11 @@ def repeat_lost_interrupts() -> None:
     """Ctrl-C comes once more where Python ignores exceptions, as in the locks of imports: a command would go on."""
     report = sys.unraisablehook
 
-    def hear(lost: Any) -> None:
-        if issubclass(lost.exc_type, KeyboardInterrupt):  # later: an exception in here is ignored as well
+    def hear(unraisable: Any) -> None:
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):  # later: an exception in here is ignored as well
             threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
         else:
-            report(lost)
+            report(unraisable)
 
     sys.unraisablehook = hear
 
@@ -105,5 +105,5 @@ def describe_exit(status: int) -> str:
     """
     if status >= 0:
         return f"its process ended with exit status {status}"
-    known = {number.value: number.name for number in signal.Signals}
-    return f"its process was ended by {known.get(-status, f'signal {-status}')}"
+    names = {number.value: number.name for number in signal.Signals}
+    return f"its process was ended by {names.get(-status, f'signal {-status}')}"
