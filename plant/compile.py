@@ -57,7 +57,7 @@ class ForeignCall:
         if self.name:
             return numba.types.ExternalFunction(self.name, result(*arguments))
 
-        def type_call(given: tuple[Any, ...]) -> Any:
+        def type_call(call_arguments: tuple[Any, ...]) -> Any:
             def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
                 types = [context.get_value_type(kind) for kind in (result, *arguments)]
                 pointer = llvmlite.ir.FunctionType(types[0], types[1:]).as_pointer()
@@ -66,9 +66,10 @@ class ForeignCall:
             return result(numba.types.int64, *arguments), code
 
         names = ", ".join(f"a{i}" for i in range(len(arguments)))
-        made: dict[str, Any] = {"type_call": type_call}
-        exec(f"def call_{self.signature}(context, address, {names}):\n    return type_call((address, {names}))", made)
-        return numba.extending.intrinsic(made[f"call_{self.signature}"])
+        namespace: dict[str, Any] = {"type_call": type_call}
+        exec(f"def call_{self.signature}(context, address, {names}):\n    return type_call((address, {names}))",
+             namespace)
+        return numba.extending.intrinsic(namespace[f"call_{self.signature}"])
 
 
 # numpy's tables of the ziggurat of the normal distribution: 256 layers, and where the tail begins
@@ -85,8 +86,8 @@ def read_normal_tables() -> NormalTables:
 
 def find_cache_folder() -> Path:
     """The folder of compiled code: $EHA_RIG_CACHE, else the user's cache folder, else a temporary one."""
-    named = os.environ.get("EHA_RIG_CACHE")
-    home = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eha-rig"
+    folder = os.environ.get("EHA_RIG_CACHE")
+    home = Path(folder) if folder else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eha-rig"
     try:
         home.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=home):
@@ -99,8 +100,8 @@ def make_private_folder(path: Path) -> Path:
     """A folder that only this user can write: code is loaded from it. Another one if somebody else has taken `path`."""
     with contextlib.suppress(FileExistsError):
         path.mkdir(mode=0o700)
-    found = path.lstat()
-    is_private = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    status = path.lstat()
+    is_private = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
     return path if is_private else _make_folder_of_process()
 
 
@@ -132,17 +133,17 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
 
     _let_lanes_fill_registers()
     root = _link_calls(function, ports or {}, lambda f: f)
-    linked = _link_calls(function, ports or {}, _declare_part, lambda call: call.declare())
+    linked_root = _link_calls(function, ports or {}, _declare_part, lambda call: call.declare())
     settings: Any = numba.config
     folder = _find_folder_of_code(root)
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
         before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
         try:
-            compiled = numba.njit(rebind_names(linked.py_func), cache=True, nogil=True, error_model="numpy")
+            kernel = numba.njit(rebind_names(linked_root.py_func), cache=True, nogil=True, error_model="numpy")
         finally:
             settings.CACHE_DIR = before
-    _compile_in_one_process(compiled, folder)
-    return compiled
+    _compile_in_one_process(kernel, folder)
+    return kernel
 
 
 @cache
@@ -263,18 +264,18 @@ def _link_calls(function: Function, ports: Mapping[str, Function], make: Callabl
 
     Each copy goes through `make`, each function of the C library through `declare`.
     """
-    made: dict[Function, Function] = {}
+    copies: dict[Function, Function] = {}
 
     def link(f: Function) -> Function:
         f = getattr(f, "py_func", f)  # an @njit function is welcome too
         if not isinstance(f, FunctionType):
             return f
-        if f not in made:
+        if f not in copies:
             calls = {name: link(ports.get(name, g) if "is_bound_later" in vars(g) else g)
                      for name, g in _find_calls(f).items()}
             external = {name: declare(g) for name, g in _find_globals(f).items() if isinstance(g, ForeignCall)}
-            made[f] = make(rebind_names(f, **calls, **external, **_copy_libraries(f, link)))
-        return made[f]
+            copies[f] = make(rebind_names(f, **calls, **external, **_copy_libraries(f, link)))
+        return copies[f]
 
     return link(function)
 
@@ -328,8 +329,8 @@ def _divides(code: CodeType) -> bool:
 
 
 def _find_calls(function: Function) -> dict[str, Function]:
-    named = {name: _find_own_version(value) for name, value in _find_globals(function).items()}
-    return {name: g for name, g in named.items() if isinstance(g, FunctionType) or hasattr(g, "py_func")}
+    values = {name: _find_own_version(value) for name, value in _find_globals(function).items()}
+    return {name: g for name, g in values.items() if isinstance(g, FunctionType) or hasattr(g, "py_func")}
 
 
 def find_called_functions(function: Function) -> dict[str, Function]:
@@ -349,8 +350,8 @@ def is_costly(function: Function) -> bool:
 
 def _find_own_version(value: Any) -> Any:
     """Our own version of a function of `math` or `numpy` if there is one, else the value itself."""
-    known = isinstance(value, BuiltinFunctionType | np.ufunc)
-    return functions.IN_PLACE_OF.get(value, value) if known else value
+    is_from_library = isinstance(value, BuiltinFunctionType | np.ufunc)
+    return functions.IN_PLACE_OF.get(value, value) if is_from_library else value
 
 
 def _copy_libraries(function: Function, link: Callable[[Function], Function]) -> dict[str, ModuleType]:
@@ -358,11 +359,11 @@ def _copy_libraries(function: Function, link: Callable[[Function], Function]) ->
     copies = {}
     for name, library in _find_globals(function).items():
         if library is math or library is np:
-            used = {f: vars(library).get(f) for f in function.__code__.co_names}
-            own = {f: link(_find_own_version(g)) for f, g in used.items() if _find_own_version(g) is not g}
-            if own:
+            members = {f: vars(library).get(f) for f in function.__code__.co_names}
+            replacements = {f: link(_find_own_version(g)) for f, g in members.items() if _find_own_version(g) is not g}
+            if replacements:
                 copies[name] = ModuleType(library.__name__)
-                copies[name].__dict__.update(vars(library) | own)
+                copies[name].__dict__.update(vars(library) | replacements)
     return copies
 
 
@@ -372,18 +373,18 @@ def compute_fingerprint(function: Function) -> str:
     It hashes the code that runs, not its file, which may have been edited since it was loaded; and this file, which
     says how the code is compiled.
     """
-    seen: dict[Function, str] = {}
+    hashes: dict[Function, str] = {}
 
     def describe_calls(f: Function) -> str:
-        if f not in seen:
-            seen[f] = ""
+        if f not in hashes:
+            hashes[f] = ""
             calls = _find_calls(f)
             below = [f"{name}={describe_calls(g)}" for name, g in calls.items()]
             constants = [f"{name}={_describe_constant(value)}"
                          for name, value in _find_globals(f).items() if name not in calls]
             whole = "\n".join([_describe_code(f), *below, *constants])
-            seen[f] = hashlib.sha256(whole.encode()).hexdigest()
-        return seen[f]
+            hashes[f] = hashlib.sha256(whole.encode()).hexdigest()
+        return hashes[f]
 
     return hashlib.sha256((_THIS_FILE + describe_calls(function)).encode()).hexdigest()[:20]
 
@@ -393,8 +394,8 @@ _THIS_FILE = "".join(Path(str(file)).read_text(encoding="utf-8") for file in (__
 
 def _describe_code(f: Function) -> str:
     f = getattr(f, "py_func", f)
-    held = [cell.cell_contents for cell in f.__closure__ or ()]
-    parts = f.__code__, *(f.__defaults__ or ()), *held, *vars(f).items()
+    cells = [cell.cell_contents for cell in f.__closure__ or ()]
+    parts = f.__code__, *(f.__defaults__ or ()), *cells, *vars(f).items()
     return " ".join(map(_describe_constant, parts))
 
 

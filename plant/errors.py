@@ -76,13 +76,13 @@ def count_nouns(count: int, noun: str, plural: str = "") -> str:
     return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
 
 
-def suggest_name(word: str, known: Iterable[str], similarity: float = 0.6) -> str:
-    """The end of a message about an unknown name: the nearest of the `known` ones, or "" if none is near.
+def suggest_name(word: str, names: Iterable[str], similarity: float = 0.6) -> str:
+    """The end of a message about an unknown name: the nearest of `names`, or "" if none is near.
 
     >>> suggest_name("spol_friction", ["jack_friction", "spool_friction"])
     '; did you mean spool_friction?'
     """
     from difflib import get_close_matches  # only a mistake needs it
 
-    near = get_close_matches(word, known, 1, similarity)
+    near = get_close_matches(word, names, 1, similarity)
     return f"; did you mean {near[0]}?" if near else ""

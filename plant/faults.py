@@ -119,11 +119,11 @@ def read_faults(path: Path, kind: Any) -> tuple[Fault, ...]:
     tables, place = parse_table(decode_text(read_file(path), path), str(path))
     for key in tables:
         place.at(key).require(key == "faults", "only tables [faults.NAME]")
-    found = tables.get("faults")
-    if not isinstance(found, dict) or not found:
+    fault_tables = tables.get("faults")
+    if not isinstance(fault_tables, dict) or not fault_tables:
         raise place.refuse("at least one table [faults.NAME]")
-    return place_faults((_read_fault(name, table, place.at("faults", name)) for name, table in found.items()), kind,
-                        path)
+    return place_faults((_read_fault(name, table, place.at("faults", name)) for name, table in fault_tables.items()),
+                        kind, path)
 
 
 def is_fault_file(path: Path) -> bool:
@@ -149,18 +149,18 @@ def place_faults(faults: Any, kind: Any, where: object = "faults") -> tuple[Faul
     Raises:
         InputError: see `place_fault`; or two faults of one parameter or symbol.
     """
-    placed: list[Fault] = []
+    complete_faults: list[Fault] = []
     owners: dict[str, str] = {}
     for fault in faults:
-        mine = place_fault(fault, kind, where)
-        if any(other.key == mine.key for other in placed):
-            mine = replace(mine, symbol=mine.name) if not fault.symbol else mine
-        for what in (*mine.parameters, mine.key):
-            require(what not in owners, where, f"faults.{mine.name}",
+        complete_fault = place_fault(fault, kind, where)
+        if any(other.key == complete_fault.key for other in complete_faults):
+            complete_fault = replace(complete_fault, symbol=complete_fault.name) if not fault.symbol else complete_fault
+        for what in (*complete_fault.parameters, complete_fault.key):
+            require(what not in owners, where, f"faults.{complete_fault.name}",
                     f"a parameter and a symbol of its own; {what} is that of {owners.get(what)}")
-            owners[what] = mine.name
-        placed.append(mine)
-    return tuple(placed)
+            owners[what] = complete_fault.name
+        complete_faults.append(complete_fault)
+    return tuple(complete_faults)
 
 
 def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
@@ -190,28 +190,28 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
           f"a parameter that a replay of the measured drive shows; {fault.parameter} is none")
     check(q.unit, "parameter", f"a parameter with a unit; {fault.parameter} is declared without one")
     check(fault.unit in ("", q.unit), "unit", f"{q.unit}, that of {fault.parameter}, not {fault.unit}")
-    known = {**{name: off for e in effects for name, off in e.off.items()}, **kind.nominal}
-    usual = {name: float(known.get(name, 0.0)) for name in fault.parameters}
+    values = {**{name: off for e in effects for name, off in e.off.items()}, **kind.nominal}
+    usual = {name: float(values.get(name, 0.0)) for name in fault.parameters}
     check(usual[fault.parameter] or not any(map(math.isnan, fault.follow.values())), "follow",
           f"a table of factors: {fault.parameter} is 0 in a healthy unit")
     follow = {name: usual[name] / usual[fault.parameter] if math.isnan(factor) else factor
               for name, factor in fault.follow.items()}
-    placed = replace(fault, unit=q.unit, symbol=fault.symbol or q.symbol or fault.name, follow=follow,
-                     healthy=usual[fault.parameter] if math.isnan(fault.healthy) else fault.healthy)
-    _check_limits(placed, q, check)
+    fault = replace(fault, unit=q.unit, symbol=fault.symbol or q.symbol or fault.name, follow=follow,
+                    healthy=usual[fault.parameter] if math.isnan(fault.healthy) else fault.healthy)
+    _check_limits(fault, q, check)
     for name, factor in follow.items():
-        led = look_up("follow", name)
-        check(not any(led.refuses(factor * size) for size in fault.range), "follow",
-              f"factors that make values of {name}, {led.expected}, over the whole range, not {factor:g}")
-    if math.isnan(placed.axis[0]):
-        beyond = 10.0 / 7.0 * (placed.maintenance - (0.0 if placed.both_ways else placed.healthy))
-        ends = placed.healthy - beyond if placed.both_ways else placed.healthy, placed.healthy + beyond
-        low, high = (min(max(end, placed.range[0]), placed.range[1]) for end in sorted(ends))
-        placed = replace(placed, axis=(low, high))
-    scatter = SCATTER * kind.find_tolerance(placed.parameter, q) * abs(placed.healthy)
-    ends = placed.healthy - scatter, placed.healthy + scatter  # a range may begin at the nominal size
-    low, high = (end if q.refuses(wider) else wider for end, wider in zip(placed.range, ends, strict=True))
-    return replace(placed, range=(min(placed.range[0], low), max(placed.range[1], high)))
+        quantity = look_up("follow", name)
+        check(not any(quantity.refuses(factor * size) for size in fault.range), "follow",
+              f"factors that make values of {name}, {quantity.expected}, over the whole range, not {factor:g}")
+    if math.isnan(fault.axis[0]):
+        beyond = 10.0 / 7.0 * (fault.maintenance - (0.0 if fault.both_ways else fault.healthy))
+        ends = fault.healthy - beyond if fault.both_ways else fault.healthy, fault.healthy + beyond
+        low, high = (min(max(end, fault.range[0]), fault.range[1]) for end in sorted(ends))
+        fault = replace(fault, axis=(low, high))
+    scatter = SCATTER * kind.find_tolerance(fault.parameter, q) * abs(fault.healthy)
+    ends = fault.healthy - scatter, fault.healthy + scatter  # a range may begin at the nominal size
+    low, high = (end if q.refuses(wider) else wider for end, wider in zip(fault.range, ends, strict=True))
+    return replace(fault, range=(min(fault.range[0], low), max(fault.range[1], high)))
 
 
 def _check_limits(f: Fault, q: Any, check: Callable[[object, str, str], None]) -> None:

@@ -75,19 +75,19 @@ def solve_ram_speed(s: State, m: Memory, p12: float, u: Input, p: Any, constant:
     return v1, after
 
 
-def run_flow_balance(flat: Any, measured: Any, position: float, record: Any, steps: int, out: Any) -> None:
-    """Fills out[k] = XJ as sensed and v at sample k, from measured (n, 2): spool position m, pressure Pa."""
+def run_flow_balance(flat: Any, rows: Any, position: float, record: Any, steps: int, out: Any) -> None:
+    """Fills out[k] = XJ as sensed and v at sample k, from measured `rows` (n, 2): spool position m, pressure Pa."""
     p = record[0]
     h = p.controller.period / steps
     constant = compute_coefficients(p, h)
     s, m = unpack_state(flat)
     s, m = rest_at_reading(s, m, position, p, steps)
-    for k in range(len(measured)):
-        ahead = min(k + 1, len(measured) - 1)
+    for k in range(len(rows)):
+        ahead = min(k + 1, len(rows) - 1)
         for i in range(steps):
             part = (i + 0.5) / steps
-            xs = measured[k, 0] + part * (measured[ahead, 0] - measured[k, 0])
-            p12 = measured[k, 1] + part * (measured[ahead, 1] - measured[k, 1])
+            xs = rows[k, 0] + part * (rows[ahead, 0] - rows[k, 0])
+            p12 = rows[k, 1] + part * (rows[ahead, 1] - rows[k, 1])
             u = Input(0.0, 0.0, 0.0, k * p.controller.period + i * h, i * h, h)
             s = State(0.0, 0.0, xs, 0.0, s.jack_position, s.jack_speed, s.pressure, s.sensed)
             v, m = solve_ram_speed(s, m, p12, u, p, constant)

@@ -55,23 +55,23 @@ def run_foreign_loop(actuator: Any, com: Array, load: Array, out: Array) -> None
     actuator.warm()
     kind, p = actuator.model.kind, actuator.model.build_record()[0]
     names = [s.name for s in kind.signals.columns]
-    shown, driven = [names.index(s.name) for s in kind.signals.outputs], names.index(kind.signals.drive.name)
+    columns, drive_column = [names.index(s.name) for s in kind.signals.outputs], names.index(kind.signals.drive.name)
     drive, memory = 0.0, kind.build_control_memory()
     for k in range(len(com)):
-        out[k, shown] = readings = actuator.sample()
+        out[k, columns] = readings = actuator.sample()
         actuator.advance(drive, float(load[k]))
         drive, memory = (kind.control or control_by_pid)(memory, float(com[k]), readings, p)
-        out[k, driven] = drive
+        out[k, drive_column] = drive
 
 
 def run_foreign(model: Any, names: Sequence[str], values: Array, driven: Array, load: Array, position: Array,
-                anchor: float, closed: bool, parts: Sequence[Any]) -> Array:
+                anchor: float, is_closed: bool, parts: Sequence[Any]) -> Array:
     """The runs of `plant.lanes.Lanes` for a plant that another program moves, one after the other.
 
     Its state cannot be pulled to the measured position. So the movement that it shows from row to row is added up, and
     what has been added up is pulled. Trials of a fit, which have `names`, are NaN where they diverge.
     """
-    if closed:
+    if is_closed:
         from plant.run import simulate
 
         runs = (simulate(model.replace(dict(zip(names, row.tolist(), strict=True))), driven, load) for row in values)
@@ -80,19 +80,19 @@ def run_foreign(model: Any, names: Sequence[str], values: Array, driven: Array, 
     program = _find_program(model.kind.foreign, period)
     out = np.empty((len(values), len(driven), len(model.kind.signals.outputs)))
     for first, stop in [(part.first, part.stop) for part in parts] or [(0, len(driven))]:
-        given = np.column_stack([np.append(0.0, driven[first:stop - 1]), load[first:stop]])
+        inputs = np.column_stack([np.append(0.0, driven[first:stop - 1]), load[first:stop]])
         for i, row in enumerate(values):
             try:
-                out[i, first:stop] = program.run({**model.values, **dict(zip(names, row, strict=True))}, given)
+                out[i, first:stop] = program.run({**model.values, **dict(zip(names, row, strict=True))}, inputs)
             except Diverged:
                 if not names:
                     raise
                 out[i, first:stop] = np.nan
         if len(position):
-            moved = np.diff(out[:, first:stop, 0], append=0.0)
+            movements = np.diff(out[:, first:stop, 0], append=0.0)
             x = out[:, first, 0].copy() if np.isnan(position[first]) else np.full(len(values), position[first])
             for k in range(first, stop):
                 out[:, k, 0] = x
                 pull = 0.0 if np.isnan(position[k]) else anchor * period * (position[k] - x)
-                x = x + moved[:, k - first] + pull
+                x = x + movements[:, k - first] + pull
     return out

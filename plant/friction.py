@@ -18,10 +18,10 @@ def soften(x: float, band: float) -> float:
     return x - clip(x, band)
 
 
-def play(x: float, held: float, half: float) -> float:
-    """The position of a part that `x` drags through a play of +-`half`; it was at `held`."""
-    held = held if held > x - half else x - half
-    return held if held < x + half else x + half
+def play(x: float, position: float, half: float) -> float:
+    """The position of a part that `x` drags through a play of +-`half`; it was at `position`."""
+    position = position if position > x - half else x - half
+    return position if position < x + half else x + half
 
 
 def solve_velocity(v0: float, impulse: float, push: float, line: float, slope: float, limit: float, dry: float,
@@ -44,9 +44,9 @@ def solve_velocity(v0: float, impulse: float, push: float, line: float, slope: f
     """
     # the factors that do not wait for `line` are multiplied among themselves: the step is as long as its chain
     v = soften(coupled * impulse + coupled * push * line, coupled * dry)
-    wanted = line - slope * v
-    held = clip(wanted, limit)
-    v = v if held == wanted else soften(impulse + push * held, dry) * free
+    linear_pressure = line - slope * v
+    pressure = clip(linear_pressure, limit)
+    v = v if pressure == linear_pressure else soften(impulse + push * pressure, dry) * free
     # no further than zero; the bounds depend on v0 alone, so that only two selects wait for v
     low, high = 0.0 if v0 > 0.0 else -inf, 0.0 if v0 < 0.0 else inf
     v = v if v > low else low

@@ -34,10 +34,10 @@ def _two_to(n: float) -> float:
 
 def exp(x: float) -> float:
     """e^x: the whole powers of two out, Taylor's series for the rest."""
-    held = x if x > -746.0 else -746.0
-    held = held if held < 710.0 else 710.0
-    n = (held * 1.4426950408889634 + ROUND) - ROUND
-    r = (held - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10  # ln 2 in two parts
+    exponent = x if x > -746.0 else -746.0
+    exponent = exponent if exponent < 710.0 else 710.0
+    n = (exponent * 1.4426950408889634 + ROUND) - ROUND
+    r = (exponent - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10  # ln 2 in two parts
     y = _exp_series(r)
     half = (0.5 * n + ROUND) - ROUND  # in two factors: 2^n alone leaves the range before e^x does
     y = y * _two_to(half) * _two_to(n - half)
@@ -62,9 +62,9 @@ def _exp_series(r: Number) -> Number:
 
 def log(x: float) -> float:
     """The natural logarithm."""
-    held = x if x > 0.0 else 1.0
-    tiny = held < 2.2250738585072014e-308
-    bits = _bits(held * 18014398509481984.0 if tiny else held)
+    positive_x = x if x > 0.0 else 1.0
+    tiny = positive_x < 2.2250738585072014e-308
+    bits = _bits(positive_x * 18014398509481984.0 if tiny else positive_x)
     high = (bits - 0x3FE6A09E667F3BCD) >> 52  # so that the rest is between sqrt(1/2) and sqrt(2)
     k = _number(high + 0x4338000000000000) - ROUND - (54.0 if tiny else 0.0)
     f = _number(bits - (high << 52)) - 1.0
@@ -173,9 +173,9 @@ def sin_of_turns(turns: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def exp_of(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """e^x of an array of any shape, the bits of `exp`."""
-    limited = np.clip(x, -746.0, 710.0)
-    n = np.rint(limited * 1.4426950408889634)
-    r = (limited - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10
+    exponents = np.clip(x, -746.0, 710.0)
+    n = np.rint(exponents * 1.4426950408889634)
+    r = (exponents - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10
     half = np.rint(0.5 * n)
     y: NDArray[np.float64] = np.ldexp(np.ldexp(_exp_series(r), half.astype(int)), (n - half).astype(int))
     return y

@@ -146,10 +146,10 @@ def build_blocks(shares: Iterable[Share], idle: int) -> list[Block]:
         first = 0
         while first < len(rows):
             width = next((w for w in kernel.widths if first + w >= len(rows)), kernel.widths[-1])
-            used = np.minimum(np.arange(first, first + width), len(rows) - 1)
-            places = np.where(np.arange(first, first + width) < len(rows), rows[used], idle)
+            members = np.minimum(np.arange(first, first + width), len(rows) - 1)
+            places = np.where(np.arange(first, first + width) < len(rows), rows[members], idle)
             # unsigned: no test for counting from the end
-            buffer = copy_to_cache_line(lanes[:, used].reshape(-1))
+            buffer = copy_to_cache_line(lanes[:, members].reshape(-1))
             blocks.append(Block(kernel.compile(width), buffer, places.astype(np.uint64)))
             first += width
     return blocks
@@ -174,9 +174,9 @@ class Lanes:
     def __init__(self, model: Model, names: Sequence[str], steps: int = STEPS, workers: int | None = None) -> None:
         self.model, self.names, self.steps = model, tuple(names), steps
         self.workers = workers or count_threads()
-        known = model.list_names()
+        parameter_names = model.list_names()
         for name in self.names:
-            require(name in known and name != "controller.period", "lanes", name,
+            require(name in parameter_names and name != "controller.period", "lanes", name,
                     f"a parameter of the model {model.name} other than the period")
         self._rungs = list_kernel_variants(model)
         self._own: dict[tuple[str, ...], KernelVariant] = {}
@@ -223,18 +223,18 @@ class Lanes:
 
         Parts of a recording are one run: what pulls the ram to the measured position makes it forget the part before.
         """
-        given = {name: value for name, value in pressures.given.items() if name in self.model.values}
-        lanes = Lanes(self.model.replace(given), self.names, self.steps, self.workers)
+        fixed_values = {name: value for name, value in pressures.given.items() if name in self.model.values}
+        lanes = Lanes(self.model.replace(fixed_values), self.names, self.steps, self.workers)
         values = np.array(values, float)
         for i, name in enumerate(self.names):
             values[:, i] = pressures.given.get(name, values[:, i])
-        used = [i for i, name in enumerate(self.names) if name in pressures.used]
-        kinds, of = np.unique(values[:, used], axis=0, return_inverse=True)
+        columns = [i for i, name in enumerate(self.names) if name in pressures.used]
+        kinds, of = np.unique(values[:, columns], axis=0, return_inverse=True)
         out = np.empty((len(values), len(current), 1))
         for i, kind in enumerate(kinds):
             rows = of.reshape(-1) == i
-            own = dict(lanes.model.values) | dict(zip((self.names[j] for j in used), kind, strict=True))
-            force = pressures.compute_force(own, chambers, current, float(self.model["controller.period"]))
+            parameters = dict(lanes.model.values) | dict(zip((self.names[j] for j in columns), kind, strict=True))
+            force = pressures.compute_force(parameters, chambers, current, float(self.model["controller.period"]))
             out[rows] = lanes._run(values[rows], current, force, position, anchor, False)[..., :1]
         return out
 
@@ -280,20 +280,20 @@ class Lanes:
         """
         return self._run(values, com, load, np.empty(0), 0.0, True)
 
-    def _run(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool,
+    def _run(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, is_closed: bool,
              parts: Sequence[Part] = (), slack: float = 0.0) -> Array:
         if self.model.kind.foreign is not None:
-            return run_foreign(self.model, self.names, values, driven, load, position, anchor, closed, parts)
-        shared, inputs = self._prepare(values, driven, load, position, anchor, closed, slack)
-        batch = Batch(shared, inputs, tuple(parts), len(values), self._count_columns(closed))
+            return run_foreign(self.model, self.names, values, driven, load, position, anchor, is_closed, parts)
+        shares, inputs = self._prepare(values, driven, load, position, anchor, is_closed, slack)
+        batch = Batch(shares, inputs, tuple(parts), len(values), self._count_columns(is_closed))
         do_together(batch, make_runs, self.workers)
         return batch.out.transpose(0, 2, 1)
 
-    def _count_columns(self, closed: bool) -> int:
+    def _count_columns(self, is_closed: bool) -> int:
         signals = self.model.kind.signals
-        return len(signals.columns if closed else signals.outputs)
+        return len(signals.columns if is_closed else signals.outputs)
 
-    def _prepare(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, closed: bool,
+    def _prepare(self, values: Array, driven: Array, load: Array, position: Array, anchor: float, is_closed: bool,
                  slack: float = 0.0) -> tuple[list[Share], tuple[Any, ...]]:
         """The runs by their kernels, and the inputs of all.
 
@@ -310,7 +310,7 @@ class Lanes:
         shares = [Share(rung, self.names, values[members], members)
                   for rung, members in self._assign_runs(values, len(driven))]
         period = float(self.model["controller.period"])
-        return shares, (driven, load, position, float(anchor), slack, closed, period, self.steps)
+        return shares, (driven, load, position, float(anchor), slack, is_closed, period, self.steps)
 
     def _assign_runs(self, values: Array, samples: int) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
         """The runs of each kernel: a run goes to the kernel with the fewest effects that has all its active ones.
@@ -321,17 +321,17 @@ class Lanes:
         if len(self._rungs) == 1:
             return [(self._rungs[0], np.arange(len(values)))]
         at_work = np.column_stack([self._find_active_runs(self.model.find_effect(name), values) for name in effects])
-        left, shared = np.ones(len(values), bool), []
+        is_left, assignments = np.ones(len(values), bool), []
         for rung in self._rungs:
-            others = [name not in rung.model.effects for name in effects]
-            fits = left & ~at_work[:, others].any(axis=1)
-            left &= ~fits
+            is_missing = [name not in rung.model.effects for name in effects]
+            fits = is_left & ~at_work[:, is_missing].any(axis=1)
+            is_left &= ~fits
             if fits.any():
-                shared.append((rung, np.flatnonzero(fits)))
-        if shared and shared[-1][0] is self._rungs[-1]:
-            _, members = shared.pop()
-            shared += self._share_costly_runs(members, at_work, samples)
-        return shared
+                assignments.append((rung, np.flatnonzero(fits)))
+        if assignments and assignments[-1][0] is self._rungs[-1]:
+            _, members = assignments.pop()
+            assignments += self._share_costly_runs(members, at_work, samples)
+        return assignments
 
     def _share_costly_runs(self, members: NDArray[np.int64], at_work: NDArray[np.bool_], samples: int
                            ) -> list[tuple[KernelVariant, NDArray[np.int64]]]:
@@ -347,20 +347,20 @@ class Lanes:
         columns = [self.model.effects.index(name) for name in costly]
         kinds, kind_of, sizes = np.unique(at_work[members][:, columns], axis=0, return_inverse=True,
                                           return_counts=True)
-        shared, is_left = [], np.ones(len(members), bool)
+        assignments, is_left = [], np.ones(len(members), bool)
         for kind in np.argsort(-sizes):
-            chosen = kind_of.reshape(-1) == kind
-            fewer = _count_blocks(is_left.sum()) - _count_blocks((is_left & ~chosen).sum())
+            is_of_kind = kind_of.reshape(-1) == kind
+            fewer = _count_blocks(is_left.sum()) - _count_blocks((is_left & ~is_of_kind).sum())
             is_few = kinds[kind].sum() <= min(FEW_COSTLY, len(costly) - 1)
             if not is_few or ALL_OVER_FEW * fewer <= _count_blocks(sizes[kind]):
                 continue
-            own = self._find_own_kernel((*cheap, *(costly[i] for i in np.flatnonzero(kinds[kind]))))
-            if own.is_ready(FEWEST * _count_blocks(sizes[kind]) * samples * self.steps):
-                shared.append((own, members[chosen]))
-                is_left &= ~chosen
+            kernel = self._find_own_kernel((*cheap, *(costly[i] for i in np.flatnonzero(kinds[kind]))))
+            if kernel.is_ready(FEWEST * _count_blocks(sizes[kind]) * samples * self.steps):
+                assignments.append((kernel, members[is_of_kind]))
+                is_left &= ~is_of_kind
         if is_left.any():
-            shared.append((self._rungs[-1], members[is_left]))
-        return shared
+            assignments.append((self._rungs[-1], members[is_left]))
+        return assignments
 
     def _find_own_kernel(self, effects: tuple[str, ...]) -> KernelVariant:
         """The kernel of the model with these effects, in the model's order."""
@@ -371,11 +371,11 @@ class Lanes:
 
     def _find_active_runs(self, effect: Effect, values: Array) -> NDArray[np.bool_]:
         """The runs in which the effect is active: one of its parameters differs from its off value."""
-        changed = np.zeros(len(values), bool)
+        is_active = np.zeros(len(values), bool)
         for name, off in effect.off.items():
             column = values[:, self.names.index(name)] if name in self.names else self.model[name]
-            changed |= column != off
-        return changed
+            is_active |= column != off
+        return is_active
 
 
 class KernelVariant:
@@ -502,17 +502,17 @@ keep_state = keep_coefficients = keep_loop = keep_drive = raise_unbound
 
 def plan_layout(effects: tuple[str, ...], kind: Plant, width: int = NARROW) -> Layout:
     """The layout for a plant with `effects`, `width` lanes."""
-    made, place = kind.bind_functions(effects), 0
+    functions, place = kind.bind_functions(effects), 0
     record = build_bare_model(kind.key).with_effects(effects).build_record()
     shapes = {"state": kind.build_start(effects), "loop": kind.build_control_memory(), "drive": Drive(),
-              "coefficients": made["compute_plant_coefficients"](record[0], 1.0)}
+              "coefficients": functions["compute_plant_coefficients"](record[0], 1.0)}
     for name, shape in shapes.items():
-        made[f"keep_{name}"], made[f"{name}_at"], place = make_lane_packers(shape, width, place)
-    made["parameters_at"] = make_record_reader(record.dtype, place * width, width)
-    return Layout(rebind_names(run_block, WIDTH=width), made, place, place + record.view(float).size)
+        functions[f"keep_{name}"], functions[f"{name}_at"], place = make_lane_packers(shape, width, place)
+    functions["parameters_at"] = make_record_reader(record.dtype, place * width, width)
+    return Layout(rebind_names(run_block, WIDTH=width), functions, place, place + record.view(float).size)
 
 
-def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, slack: float, closed: bool, period: float,
+def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, slack: float, is_closed: bool, period: float,
               steps: int, first: int, stop: int, origin: int, later: int, begins: bool, rows: Any, out: Any) -> None:
     """Simulates a block of runs over the samples k = first..stop-1.
 
@@ -525,7 +525,7 @@ def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, slack: 
         position: (n,) measured controlled signal; NaN where missing; or (0,).
         anchor: 1/s, how fast the plant is pulled to it.
         slack: how far it may be off before the plant is pulled.
-        closed: with the model's own controller.
+        is_closed: with the model's own controller.
         period: of a cycle, s.
         steps: steps a cycle.
         first: the first sample.
@@ -542,14 +542,14 @@ def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, slack: 
             begin_lane(a, lane, position[first:], steps, h)
     for k in range(first, stop):
         t, column = (k + later) * period, k - origin
-        given = com[k - 1] if k > first or not begins else 0.0
+        drive = com[k - 1] if k > first or not begins else 0.0
         for lane in range(WIDTH):
             y = sample_lane(a, lane, t)
-            keep_sample(y, out, rows[lane], column, closed)
-            if closed:
+            keep_sample(y, out, rows[lane], column, is_closed)
+            if is_closed:
                 keep_answer(control_lane(a, lane, t, com[k], y), out, rows[lane], column)
             else:
-                keep_drive(Drive(given, 0.0), a, lane)
+                keep_drive(Drive(drive, 0.0), a, lane)
         if len(position):
             for lane in range(WIDTH):
                 s, m = state_at(a, lane)

@@ -90,10 +90,10 @@ def find_function_address(run: Any) -> int:
 
 def _gives_same_bits(code: bytes, run: Any, make_arguments: Callable[[], Sequence[Any]]) -> bool:
     """Whether the object code changes arrays as numba's function does; else it is not to be stored."""
-    engine, expected, found = _link_object(code), make_arguments(), make_arguments()
-    run(*expected)
-    status = _make_entry(engine, found)(*_list_places(found))
-    arrays = zip(_list_arrays(expected), _list_arrays(found), strict=True)
+    engine, numba_arguments, code_arguments = _link_object(code), make_arguments(), make_arguments()
+    run(*numba_arguments)
+    status = _make_entry(engine, code_arguments)(*_list_places(code_arguments))
+    arrays = zip(_list_arrays(numba_arguments), _list_arrays(code_arguments), strict=True)
     return status == 0 and all(one.tobytes() == other.tobytes() for one, other in arrays)
 
 

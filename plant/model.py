@@ -103,19 +103,19 @@ class Model:
         values = {name: parse_value(where, name, find_quantity(name, where, self.plant), value)
                   for name, value in changes.items()}
         model = self.with_effects(name.partition(".")[0] for name in changes)
-        merged = {**model.values, **values}
-        check_combinations(where, merged)
-        check_exclusions(where, model, merged)
-        return replace(model, values=merged)
+        all_values = {**model.values, **values}
+        check_combinations(where, all_values)
+        check_exclusions(where, model, all_values)
+        return replace(model, values=all_values)
 
     def with_effects(self, groups: Iterable[str]) -> Self:
         """The model with the effects among `groups` added at their off values."""
-        wanted = set(groups) | set(self.effects)
-        found = [e for e in self.kind.list_effects() if e.name in wanted and not e.base]
+        names = set(groups) | set(self.effects)
+        effects = [e for e in self.kind.list_effects() if e.name in names and not e.base]
         usual = self.nominal
-        off = {name: usual.get(name, value) for e in found if e.name not in self.effects
+        off = {name: usual.get(name, value) for e in effects if e.name not in self.effects
                for name, value in e.off.items()}
-        return replace(self, values={**self.values, **off}, effects=tuple(e.name for e in found))
+        return replace(self, values={**self.values, **off}, effects=tuple(e.name for e in effects))
 
     def __getitem__(self, name: str) -> float:
         return self.values[name]
@@ -165,8 +165,8 @@ class Model:
         if self.kind.sense is None:
             return s, m
         # once in plain Python, because the first sample is read before the first step
-        shown = build_kernel(show_start, self.effects, False, self.plant)(s, m, self.build_record()[0])
-        return self.kind.state(*map(float, shown)), m
+        state = build_kernel(show_start, self.effects, False, self.plant)(s, m, self.build_record()[0])
+        return self.kind.state(*map(float, state)), m
 
     def build_flat_state(self) -> NDArray[np.float64]:
         """`build_start` as an array, the state first."""
@@ -211,13 +211,13 @@ def find_plant_of_model(source: str | Path) -> str:
     return _find_plant(read_model_tables(path).get("plant", "eha"), path)
 
 
-def _find_plant(named: Any, where: object) -> str:
-    plant = read_named_plant(named, where)
-    loaded = find_loaded_plant(plant, where) if isinstance(plant, str) and plant.endswith(".py") else None
-    if loaded is None and not (isinstance(plant, str) and is_known(plant)):
+def _find_plant(plant_entry: Any, where: object) -> str:
+    plant = read_named_plant(plant_entry, where)
+    loaded_plant = find_loaded_plant(plant, where) if isinstance(plant, str) and plant.endswith(".py") else None
+    if loaded_plant is None and not (isinstance(plant, str) and is_known(plant)):
         more = "an FMU, or a plant file (.py), which runs with --trust"
         raise InputError(where, "plant", f"one of {', '.join(list_plants())}, or {more}, not {plant!r}")
-    return str(plant) if loaded is None else loaded.key
+    return str(plant) if loaded_plant is None else loaded_plant.key
 
 
 def find_shipped_model(name: str) -> Path | None:
@@ -240,14 +240,14 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     """
     tables = {key: x for key, x in tables.items() if key not in ("provenance", "identify", "plant_sha256")}
     name, effects = tables.pop("name", name), tables.pop("effects", [])
-    named = tables.pop("plant", "eha")
+    plant_entry = tables.pop("plant", "eha")
     design = tables.pop("design", {})
     require(isinstance(name, str) and name, where, "name", f"a text, not {name!r}")
-    plant = _find_plant(named, where)
-    known = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable
-    unknown = [e for e in effects if e not in known] if isinstance(effects, list) else [effects]
+    plant = _find_plant(plant_entry, where)
+    names = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable
+    unknown = [e for e in effects if e not in names] if isinstance(effects, list) else [effects]
     if unknown:
-        hint = suggest_name(str(unknown[0]), known)
+        hint = suggest_name(str(unknown[0]), names)
         raise InputError(where, "effects", f"names of effects (rig effects lists them), not {unknown[0]!r}{hint}")
     require(isinstance(design, Mapping), where, "design", "tables [design.GROUP] of nominal values")
     values = flatten_tables(where, tables, find_plant(plant).list_groups())
@@ -276,12 +276,12 @@ def find_effect(name: str, plant: str = "eha") -> Effect:
     Raises:
         InputError: there is none of that name.
     """
-    known = {e.name: e for e in list_offered_effects(plant)}
-    if name not in known:
-        hint = suggest_name(name, known, 0.5) or " (rig effects lists them)"
+    effects = {e.name: e for e in list_offered_effects(plant)}
+    if name not in effects:
+        hint = suggest_name(name, effects, 0.5) or " (rig effects lists them)"
         hint = f" that suits the plant {plant}" if name in CATALOGUE.list_all() else hint
         raise InputError("effect", name, f"an effect of the catalogue{hint}")
-    return known[name]
+    return effects[name]
 
 
 def build_kernel(function: Function, effects: tuple[str, ...], fast: bool = True, plant: str = "eha") -> Function:

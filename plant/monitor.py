@@ -84,15 +84,15 @@ def step_monitor(s: Motion, current: float, h: float, c: Cell) -> Motion:
     Exact, but for the step in which the spool meets its stop or P12 its limit, and for the bend of XS within the lag.
     """
     tilt = c.tilt * current - c.back * s.spool
-    asked = soften(tilt, c.slide)  # through the dead zone; from here on it only falls
-    asked = asked if asked * s.sliding > 0.0 or abs(tilt) > c.dead else 0.0
-    begin = clip(asked, c.most)
-    wait = abs(asked - begin) * c.wait  # s, the flapper at its stop
+    net_tilt = soften(tilt, c.slide)  # through the dead zone; from here on it only falls
+    net_tilt = net_tilt if net_tilt * s.sliding > 0.0 or abs(tilt) > c.dead else 0.0
+    begin = clip(net_tilt, c.most)
+    wait = abs(net_tilt - begin) * c.wait  # s, the flapper at its stop
     wait = wait if wait < h else h
     end = begin * compute_decay(c.rate * (wait - h))
-    line, curve, left = c.speed * begin * wait, (begin - end) * c.unback, h - wait
+    line, curve, time_left = c.speed * begin * wait, (begin - end) * c.unback, h - wait
     spool = clip(s.spool + line + curve, c.spool_travel)
-    area = line * (0.5 * wait + left) + (begin * left - (begin - end) * c.unrate) * c.unback
+    area = line * (0.5 * wait + time_left) + (begin * time_left - (begin - end) * c.unrate) * c.unback
     total = clip(h * s.spool + area, h * c.spool_travel)  # integral of XS
     before = s.spool - c.lag * c.speed * begin
     free = c.follow * (spool - c.lag * c.speed * end) + (s.speed - c.follow * before) * c.fade
@@ -101,8 +101,8 @@ def step_monitor(s: Motion, current: float, h: float, c: Cell) -> Motion:
     v = v if v < high else high
     way = c.follow * total - c.lag * (v - s.speed) if v == free else 0.5 * h * (s.speed + v)
     x = s.position + way
-    sliding = 1.0 if asked > 0.0 else 0.0
-    sliding = sliding if asked >= 0.0 else -1.0
+    sliding = 1.0 if net_tilt > 0.0 else 0.0
+    sliding = sliding if net_tilt >= 0.0 else -1.0
     return Motion(spool, clip(x, c.jack_travel), v if abs(x) <= c.jack_travel else 0.0, sliding)
 
 
@@ -114,9 +114,9 @@ def compute_cells(model: Model, names: Sequence[str], values: Array, h: float, s
     def of(name: str) -> Array:
         return values[:, names.index(name)] if name in names else np.full(len(values), model[name])
 
-    left = 1.0 - of("filter.clogging")  # 1 - Kintas
+    opening = 1.0 - of("filter.clogging")  # 1 - Kintas
     kf, ksf, asv = of("flapper.stiffness"), of("feedback_spring.stiffness"), of("spool.end_area")
-    gpf1, speed = of("pilot.pressure_gain") * left, of("pilot.flow_gain") * left**of("filter.law") / asv
+    gpf1, speed = of("pilot.pressure_gain") * opening, of("pilot.flow_gain") * opening**of("filter.law") / asv
     dead = of("spool.static_friction") / (gpf1 * asv)
     most = np.maximum(of("flapper.travel") - sliding * dead, 0.0)
     gp, aj, cj, mj, psr = (of(name) for name in (
@@ -134,10 +134,10 @@ def compute_cells(model: Model, names: Sequence[str], values: Array, h: float, s
 motion_at = loop_at = drive_at = cell_at = controller_at = keep_motion = keep_loop = keep_drive = raise_unbound
 
 
-def sample_lane(a: Any, lane: int, pulled: float, shown: float) -> float:
-    """Position of one lane's ram, m; and pull the ram to the position `shown` by the share `pulled`."""
+def sample_lane(a: Any, lane: int, pull: float, target: float) -> float:
+    """Position of one lane's ram, m; and pull the ram to the position `target` by the share `pull`."""
     s = motion_at(a, lane)
-    keep_motion(Motion(s.spool, s.position + pulled * (shown - s.position), s.speed, s.sliding), a, lane)
+    keep_motion(Motion(s.spool, s.position + pull * (target - s.position), s.speed, s.sliding), a, lane)
     position: float = s.position
     return position
 
@@ -149,7 +149,7 @@ def control_lane(a: Any, lane: int, demand: float, position: float) -> None:
     keep_drive(Drive(drive_at(a, lane).next, cor), a, lane)
 
 
-def run_monitor_block(a: Any, driven: Any, position: Any, anchor: float, closed: bool, period: float, steps: int,
+def run_monitor_block(a: Any, driven: Any, position: Any, anchor: float, is_closed: bool, period: float, steps: int,
                       out: Any) -> None:
     """A block of runs; fills out[:, k, lane] = XJ, or XJ, Cor, P12 and XS, at sample k.
 
@@ -158,7 +158,7 @@ def run_monitor_block(a: Any, driven: Any, position: Any, anchor: float, closed:
         driven: (n,) demand m in closed loop, else the measured current A: driven[k - 1] acts from k to k + 1.
         position: (n,) m, measured, to which the ram is pulled; or (1,), where it starts; or (0,), in the middle.
         anchor: 1/s, how fast it is pulled.
-        closed: with the controller.
+        is_closed: with the controller.
         period: of a cycle, s.
         steps: a cycle.
         out: (1 or 4, n, WIDTH), written.
@@ -167,27 +167,27 @@ def run_monitor_block(a: Any, driven: Any, position: Any, anchor: float, closed:
     for lane in range(WIDTH):
         keep_motion(Motion(0.0, position[0] if len(position) else 0.0, 0.0, 0.0), a, lane)
     for k in range(n):
-        given = driven[k - 1] if k else 0.0
-        there = len(position) == n and position[k] == position[k]
-        pulled, shown = (anchor * period, position[k]) if there else (0.0, 0.0)
+        current = driven[k - 1] if k else 0.0
+        is_measured = len(position) == n and position[k] == position[k]
+        pull, target = (anchor * period, position[k]) if is_measured else (0.0, 0.0)
         for lane in range(WIDTH):
-            out[0, k, lane] = sample_lane(a, lane, pulled, shown)
-        if closed:
+            out[0, k, lane] = sample_lane(a, lane, pull, target)
+        if is_closed:
             for lane in range(WIDTH):
                 control_lane(a, lane, driven[k], out[0, k, lane])
         if len(out) > 1:
             for lane in range(WIDTH):
                 s, c = motion_at(a, lane), cell_at(a, lane)
-                out[1, k, lane] = drive_at(a, lane).next if closed else driven[k]
+                out[1, k, lane] = drive_at(a, lane).next if is_closed else driven[k]
                 out[2, k, lane] = clip(c.pressure_gain * s.spool - c.pressure_slope * s.speed, c.pressure_limit)
                 out[3, k, lane] = s.spool
         for _ in range(steps):
-            if closed:
+            if is_closed:
                 for lane in range(WIDTH):  # the loop that everything is for
                     keep_motion(step_monitor(motion_at(a, lane), drive_at(a, lane).now, h, cell_at(a, lane)), a, lane)
             else:
                 for lane in range(WIDTH):
-                    keep_motion(step_monitor(motion_at(a, lane), given, h, cell_at(a, lane)), a, lane)
+                    keep_motion(step_monitor(motion_at(a, lane), current, h, cell_at(a, lane)), a, lane)
 
 
 PARTS = {"motion": Motion(), "loop": Loop(), "drive": Drive(), "cell": Cell(*[0.0] * len(Cell._fields)),
@@ -198,10 +198,10 @@ STATES = 9  # numbers of the first three
 @cache
 def compile_monitor_kernel() -> Function:
     """`run_monitor_block` as machine code; the first call on a machine takes some seconds."""
-    made, place = {}, 0
+    packers, place = {}, 0
     for name, shape in PARTS.items():
-        made[f"keep_{name}"], made[f"{name}_at"], place = make_lane_packers(shape, WIDTH, place)
-    return compile_function(run_monitor_block, made)
+        packers[f"keep_{name}"], packers[f"{name}_at"], place = make_lane_packers(shape, WIDTH, place)
+    return compile_function(run_monitor_block, packers)
 
 
 class Monitor:
@@ -244,7 +244,7 @@ class Monitor:
         """The monitor with the model's controller over a command `com` (n,) m, at rest at `start` m; as `replay`."""
         return self._run(values, com, np.array([start]), 0.0, True, whole, reduced)
 
-    def _run(self, values: Array, driven: Array, position: Array, anchor: float, closed: bool, whole: bool,
+    def _run(self, values: Array, driven: Array, position: Array, anchor: float, is_closed: bool, whole: bool,
              reduced: Reduction) -> Array:
         values, driven, position = (np.ascontiguousarray(x, float) for x in (values, driven, position))
         require(values.ndim == 2 and values.shape[1] == len(self.names), "monitor", "values",
@@ -255,7 +255,7 @@ class Monitor:
         period = float(self.model["controller.period"])
         kv = compute_cells(self.model, self.names, values, period, self.sliding)[Cell._fields.index("rate")]
         steps = max(self.steps, ceil(period * kv.max(initial=0.0)))  # `compute_decay` reaches no further
-        inputs = driven, position, float(anchor), closed, period, steps
+        inputs = driven, position, float(anchor), is_closed, period, steps
         run = compile_monitor_kernel()
 
         def do(block: tuple[int, Array]) -> Array:

@@ -76,9 +76,9 @@ Controller = GROUPS["controller"]
 
 def convert_group_unit(group: type[Any], unit: str, other: str, wider: float) -> type[Any]:
     """A parameter group whose fields are in another unit, such as raw/m for A/m, and as much wider in range."""
-    changed = {name: q._replace(unit=q.unit.replace(unit, other), high=wider * q.high) if unit in q.unit else q
-               for name, q in list_quantities(group).items()}
-    return make_group(group.__name__, str(group.__doc__), changed, __name__)
+    quantities = {name: q._replace(unit=q.unit.replace(unit, other), high=wider * q.high) if unit in q.unit else q
+                  for name, q in list_quantities(group).items()}
+    return make_group(group.__name__, str(group.__doc__), quantities, __name__)
 
 
 def parse_value(where: object, name: str, quantity: Quantity, value: object) -> float:
@@ -110,15 +110,15 @@ def find_field(where: object, name: str, groups: Mapping[str, type[Any]]) -> Qua
     group, _, field = name.partition(".")
     if group not in groups:
         raise InputError(where, name, f"a known group{_suggest_nearest(group, groups)}")
-    known = list_quantities(groups[group])
-    if field not in known:
-        hint = _suggest_nearest(field, known) or f" ({', '.join(known)})"
+    quantities = list_quantities(groups[group])
+    if field not in quantities:
+        hint = _suggest_nearest(field, quantities) or f" ({', '.join(quantities)})"
         raise InputError(where, name, f"a field of {group}{hint}")
-    return known[field]
+    return quantities[field]
 
 
-def _suggest_nearest(word: str, known: Mapping[str, Any]) -> str:
-    return suggest_name(word, known) or (f" ({', '.join(known)})" if len(known) < 8 else "")
+def _suggest_nearest(word: str, names: Mapping[str, Any]) -> str:
+    return suggest_name(word, names) or (f" ({', '.join(names)})" if len(names) < 8 else "")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

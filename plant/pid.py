@@ -23,9 +23,9 @@ def compute_current(c: Loop, demand: float, position: float, p: Any) -> tuple[fl
     error = demand - position
     rate = (error - c.error) / p.period if c.cycles > 0.0 else 0.0
     integral = c.integral + p.integral_gain * error * p.period
-    wanted = p.proportional_gain * error + integral + p.derivative_gain * rate
-    current = clip(wanted, p.current_limit)
-    winding = current != wanted and wanted * error > 0.0
+    unlimited_current = p.proportional_gain * error + integral + p.derivative_gain * rate
+    current = clip(unlimited_current, p.current_limit)
+    winding = current != unlimited_current and unlimited_current * error > 0.0
     return current, Loop(c.integral if winding else integral, error, c.cycles + 1.0)
 
 

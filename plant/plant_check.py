@@ -50,26 +50,26 @@ def check_declaration(plant: Plant, where: object) -> None:
         elif function is not None or name in ("step", "measure"):
             require(callable(function) and len(inspect.signature(function).parameters) in counts, where, name,
                     f"a function of {' or '.join(map(str, counts))} arguments")
-    known = {f"{group}.{name}" for group, cls in plant.parameters.items() for name in cls._fields}
+    names = {f"{group}.{name}" for group, cls in plant.parameters.items() for name in cls._fields}
     for signal in plant.signals:
         for use, name in (("noise", signal.noise), ("limit", signal.limit)):
-            require(not name or name in known, where, f"signal {signal.name}, {use}", f"a parameter, not {name!r}")
+            require(not name or name in names, where, f"signal {signal.name}, {use}", f"a parameter, not {name!r}")
     for e in plant.effects.values():
         require(e.base or e.port in plant.ports, where, f"effect {e.name}",
                 f"one of the ports that the step has ({', '.join(plant.ports)}), not {e.port!r}")
         require(e.base or e.name not in plant.parameters, where, f"effect {e.name}",
                 "a name that no parameter group has")
-        require(set(e.fitted) <= (known if e.base else set(e.parameters)), where, f"effect {e.name}",
+        require(set(e.fitted) <= (names if e.base else set(e.parameters)), where, f"effect {e.name}",
                 f"parameters that exist, not {', '.join(e.fitted)}")
         unknown = sorted(find_fields_of(e.function, "p") - {*plant.parameters, e.name}) if e.function else []
         require(not unknown, where, f"effect {e.name}",
                 f"p.{e.name}.FIELD for its own parameters, or a group of the plant ({', '.join(plant.parameters)}), "
                 f"not p.{', p.'.join(unknown)}")
-    known |= {name for e in plant.list_effects() for name in e.parameters}
+    names |= {name for e in plant.list_effects() for name in e.parameters}
     for fault in plant.faults:
         require(isinstance(fault, Fault), where, "faults", "values Fault(...)")
-        require(fault.parameter in known, where, f"fault {fault.name}, parameter",
-                f"a parameter of the plant or of an effect{suggest_name(fault.parameter, known)}")
+        require(fault.parameter in names, where, f"fault {fault.name}, parameter",
+                f"a parameter of the plant or of an effect{suggest_name(fault.parameter, names)}")
     require(all(isinstance(s, Segment) for s in plant.profile), where, "profile",
             "segments such as Step(to=1e-3, time=1.0)")
     _check_readings(plant, where)
@@ -163,32 +163,32 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
         return
     silent = [s.name for s in kind.signals.outputs if np.ptp(once[s.name]) == 0.0]
     yield Finding("signals", not silent, f"no change of {', '.join(silent)}" if silent else "every output changes")
-    compiled, plain = run(20, 300), run(20, 300, fast=False)
-    same = all(np.array_equal(compiled[name], plain[name]) for name in compiled)
-    yield Finding("compiled code", same, "the bits of plain Python" if same else "differs from plain Python")
+    compiled_run, plain_run = run(20, 300), run(20, 300, fast=False)
+    is_same = all(np.array_equal(compiled_run[name], plain_run[name]) for name in compiled_run)
+    yield Finding("compiled code", is_same, "the bits of plain Python" if is_same else "differs from plain Python")
     finer = run(2 * model.steps)
     errors = {s.name: rms(finer[s.name] - once[s.name]) / max(np.ptp(once[s.name]), 1e-300)
               for s in kind.signals.outputs if s.name not in silent}
     if worst := max(errors, key=lambda name: errors[name], default=""):
         yield Finding("step", errors[worst] < MOST_STEP_ERROR, f"half the step changes {worst} by "
                       f"{100 * errors[worst]:.2g} % of its range (limit {100 * MOST_STEP_ERROR:g} %)")
-    there = np.full(2 * PUSHED_ROWS, 0.1 * np.ptp(once[kind.signals.controlled.name]))
+    target = np.full(2 * PUSHED_ROWS, 0.1 * np.ptp(once[kind.signals.controlled.name]))
     push = np.repeat([np.abs(once[kind.signals.drive.name]).max(), 0.0], PUSHED_ROWS)
     idle, lanes = 0.0 * push, Lanes(quiet, ())
-    left, moved, pushed = (lanes.replay(np.empty((1, 0)), drive, idle, position)[0, :, 0]
-                           for drive, position in ((idle, None), (idle, there), (push, None)))
-    apart = (moved - left)[-1]
-    kept = bool(abs(apart - there[0]) <= MOST_STRAY * there[0]
-                or abs(pushed[-1]) < MOST_STRAY * abs(pushed[PUSHED_ROWS]))  # it springs back
-    yield Finding("moves", kept, "the plant stays where a replay moves it" if kept else
-                  f"moved by {there[0]:.3g} {kind.signals.controlled.unit}, the plant goes to {apart:.3g}: "
+    idle_path, moved_path, pushed_path = (lanes.replay(np.empty((1, 0)), drive, idle, position)[0, :, 0]
+                                          for drive, position in ((idle, None), (idle, target), (push, None)))
+    distance = (moved_path - idle_path)[-1]
+    is_moved = bool(abs(distance - target[0]) <= MOST_STRAY * target[0]
+                    or abs(pushed_path[-1]) < MOST_STRAY * abs(pushed_path[PUSHED_ROWS]))  # it springs back
+    yield Finding("moves", is_moved, "the plant stays where a replay moves it" if is_moved else
+                  f"moved by {target[0]:.3g} {kind.signals.controlled.unit}, the plant goes to {distance:.3g}: "
                   "every field of the state has to move along, a motor's angle by the gear ratio")
     error = rms(once[kind.signals.command.name] - once[kind.signals.controlled.name]) / max(np.ptp(command), 1e-300)
     yield Finding("control", error < MOST_FOLLOWING_ERROR, f"following error {100 * error:.2g} % of the command's "
                   f"range (limit {100 * MOST_FOLLOWING_ERROR:g} %)")
     for name, e in kind.effects.items():
-        found = check_effect(name, command, plant=kind.key)
-        yield Finding(f"effect {name}", not found.faults, "; ".join(found.faults) or (
+        report = check_effect(name, command, plant=kind.key)
+        yield Finding(f"effect {name}", not report.faults, "; ".join(report.faults) or (
             "a parameter of the plant" if e.base else "exact at its off value, finite, repeatable"))
 
 

@@ -22,7 +22,7 @@ def read_model_tables(path: Path) -> dict[str, Any]:
     return {"plant": path.name} if path.suffix in READERS and path.suffix != ".toml" else read_toml(path)
 
 
-def read_named_plant(named: Any, where: object) -> Any:
+def read_named_plant(plant_entry: Any, where: object) -> Any:
     """What models call the plant that the file `where` names: a file beside it, or a table of its own.
 
     Any other name stays as it is.
@@ -31,11 +31,11 @@ def read_named_plant(named: Any, where: object) -> Any:
         InputError: the file cannot be used.
     """
     path = Path(str(where))
-    if isinstance(named, str):
-        path = path.parent / named if (path.parent / named).is_file() else Path(named)
-    elif not isinstance(named, Mapping):
-        return named
+    if isinstance(plant_entry, str):
+        path = path.parent / plant_entry if (path.parent / plant_entry).is_file() else Path(plant_entry)
+    elif not isinstance(plant_entry, Mapping):
+        return plant_entry
     if path.suffix not in READERS:
-        return named
+        return plant_entry
     module, _, function = READERS[path.suffix].partition(":")
     return getattr(import_module(module), function)(path).key

@@ -183,8 +183,8 @@ class Plant:
     def ports(self) -> Mapping[str, Port]:
         """The ports at which effects can act, in their order: those of its step, and those of the sampled loop."""
         whole = [f for f in (self.step, self.sense, *(v for v, _ in self.variants.values())) if f is not None]
-        found = {name[3:]: g.port for f in whole for name, g in find_called_functions(f).items() if hasattr(g, "port")}
-        ordered = sorted(found.items(), key=lambda item: item[1].number)
+        ports = {name[3:]: g.port for f in whole for name, g in find_called_functions(f).items() if hasattr(g, "port")}
+        ordered = sorted(ports.items(), key=lambda item: item[1].number)
         command, reading = (f.port._replace(unit=self.signals.controlled.unit) for f in (at_command, at_reading))
         return {"command": command, **dict(ordered), "reading": reading}
 
@@ -200,13 +200,13 @@ class Plant:
     def list_effects(self) -> list[Effect]:
         """The effects it can have: those of the catalogue that suit it, then its own, which may have their names."""
         everything = CATALOGUE.list_all()
-        shared = (e for e in map(self.find_effect, everything) if self.offers(e))
-        return [*shared, *(e for name, e in self.effects.items() if name not in everything)]
+        catalogue_effects = (e for e in map(self.find_effect, everything) if self.offers(e))
+        return [*catalogue_effects, *(e for name, e in self.effects.items() if name not in everything)]
 
     def list_groups(self, names: Iterable[str] | None = None) -> dict[str, type[Any]]:
         """The parameter groups of the plant and of the effects `names`, by default of all that it can have."""
-        chosen = self.list_effects() if names is None else [self.find_effect(name) for name in names]
-        return {**self.parameters, **{e.name: e.group for e in chosen if e.group is not None}}
+        effects = self.list_effects() if names is None else [self.find_effect(name) for name in names]
+        return {**self.parameters, **{e.name: e.group for e in effects if e.group is not None}}
 
     def find_effect(self, name: str) -> Effect:
         """Its own effect of that name, else that of the catalogue. Raises KeyError."""
@@ -234,9 +234,9 @@ class Plant:
             return False
         if e.plant == self.name:
             return True
-        shared, own = PORTS[e.port].unit or "m", self.ports[e.port].unit  # those of the EHA, for which it was written
+        unit, own_unit = PORTS[e.port].unit or "m", self.ports[e.port].unit  # of the EHA, for which it was written
         is_own = e.function is not None and not e.function.__module__.startswith("plant.")  # in a file of the user's
-        has_unit = shared == own or not any(shared in re.split(r"[ /()]", q.unit) for q in e.parameters.values())
+        has_unit = unit == own_unit or not any(unit in re.split(r"[ /()]", q.unit) for q in e.parameters.values())
         return is_own or (has_unit and self._has_what_law_names(e))
 
     def _has_what_law_names(self, e: Effect) -> bool:
@@ -249,18 +249,18 @@ class Plant:
     def bind_functions(self, names: tuple[str, ...]) -> dict[str, Function]:
         """The functions that take the place of the placeholders in every kernel, for the plant with these effects."""
         effects = [self.find_effect(name) for name in names]
-        bound = dict(self._functions)
+        functions = dict(self._functions)
         for name in self.ports:
             acting = [e for e in effects if e.port == name]
             law, _ = combine_laws(name, acting)
-            bound[f"at_{name}"] = law if not acting else bind_port(
+            functions[f"at_{name}"] = law if not acting else bind_port(
                 name, law, any(e.memory is not None for e in acting), self.memory)
         shifts = {name: [e.shift for e in effects if e.port == name] for name in self.ports}
-        bound["shift_memories"] = bind_shifts(
+        functions["shift_memories"] = bind_shifts(
             ((name, chain_shifts(own)) for name, own in shifts.items() if any(own)), self.memory)
-        bound["pack_state"], bound["unpack_state"] = make_packers(self.build_start(names))
+        functions["pack_state"], functions["unpack_state"] = make_packers(self.build_start(names))
         acting_at = {e.port for e in effects}
-        return bound | {name: f for name, (f, ports) in self.variants.items() if not ports or ports & acting_at}
+        return functions | {name: f for name, (f, ports) in self.variants.items() if not ports or ports & acting_at}
 
     @cached_property
     def move(self) -> Function:
@@ -304,11 +304,11 @@ class Plant:
         """The numbers of the fields of the state that `measure` shows as they are; None: it computes something."""
         marks = [object() for _ in self.state._fields]
         try:
-            shown = self.measure(self.state(*marks), None)
+            readings = self.measure(self.state(*marks), None)
         except Exception:  # it computes with what is no number here
             return None
-        found = [i for y in shown for i, mark in enumerate(marks) if y is mark]
-        return found if len(found) == len(self.signals.outputs) else None
+        numbers = [i for y in readings for i, mark in enumerate(marks) if y is mark]
+        return numbers if len(numbers) == len(self.signals.outputs) else None
 
     def build_control_memory(self) -> Any:
         """What the law of the controller remembers at the start."""
@@ -393,8 +393,8 @@ def effect(port: str, group: Group, **more: Any) -> Callable[[Function], Functio
     `more`: law, symptoms, memory, fitted, starts, source, ..., see there.
     """
     def register(function: Function) -> Function:
-        made = build_effect(function, port, group, **more)
-        function.__globals__.setdefault(OWN_EFFECTS, {})[made.name] = made
+        new_effect = build_effect(function, port, group, **more)
+        function.__globals__.setdefault(OWN_EFFECTS, {})[new_effect.name] = new_effect
         return function
 
     return register
@@ -405,10 +405,10 @@ def base_effect(name: str, group: type[Any], *fields: str, **more: Any) -> None:
 
     `more`: law, symptoms, starts, source, ..., as those of an effect.
     """
-    there = sys._getframe(1).f_globals
+    namespace = sys._getframe(1).f_globals
     names = [f"{name_group(group)}.{field}" for field in fields]
-    made = build_base_effect(name, *names, groups={name_group(group): group}, **more)
-    there.setdefault(OWN_EFFECTS, {})[made.name] = made
+    new_effect = build_base_effect(name, *names, groups={name_group(group): group}, **more)
+    namespace.setdefault(OWN_EFFECTS, {})[new_effect.name] = new_effect
 
 
 def load_plant(path: Path, source: bytes | None = None, key: str = "") -> Plant:
@@ -425,11 +425,11 @@ def load_plant(path: Path, source: bytes | None = None, key: str = "") -> Plant:
     key, path = key or str(path), path.absolute()
     require(source is not None or path.is_file(), path, "", "a Python file that declares a plant; it does not exist")
     code = read_file(path) if source is None else source
-    known = _LOADED.get(key)
-    if known is not None and (known.file, known.source) == (path, code):
-        return known
+    loaded_plant = _LOADED.get(key)
+    if loaded_plant is not None and (loaded_plant.file, loaded_plant.source) == (path, code):
+        return loaded_plant
     plant = replace(find_declared_plant(run_file(path, code), path.stem, path, key), source=code)
-    before, _LOADED[key] = known, plant
+    before, _LOADED[key] = loaded_plant, plant
     try:
         check_declaration(plant, path)
     except InputError:
@@ -457,8 +457,8 @@ def find_declared_plant(module: ModuleType, name: str, file: Path | None = None,
         raise InputError(file or name, "PLANT", "PLANT = Plant(...)")
     title = plant.name or name
     own = {e.name: replace(e, plant=title) for e in vars(module).get(OWN_EFFECTS, {}).values()}
-    made = replace(plant, name=title, file=file, effects=own, key=key or name)
+    plant = replace(plant, name=title, file=file, effects=own, key=key or name)
     with explain_errors(str(file or name), "step"):  # its ports are those of the functions that it calls
-        ports = made.ports
+        ports = plant.ports
     PORTS.update({name: port for name, port in ports.items() if name not in PORTS})
-    return made
+    return plant

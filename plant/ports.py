@@ -39,9 +39,9 @@ def port(unit: str, meaning: str) -> Function:
         unit: of the signal.
         meaning: of the signal, for people.
     """
-    made: Any = bind_later(rebind_names(pass_signal))
-    made.port = Port(unit, meaning, next(_NUMBERS))
-    return made
+    placeholder: Any = bind_later(rebind_names(pass_signal))
+    placeholder.port = Port(unit, meaning, next(_NUMBERS))
+    return placeholder
 
 
 # around every plant's step, once a cycle; in the unit of the controlled signal
@@ -66,9 +66,9 @@ PORTS: dict[str, Port] = {name[3:]: value.port for name, value in list(globals()
 
 def make_memory_type(names: Sequence[str]) -> type[Any]:
     """The memories of all effects of a plant with these ports: a NamedTuple with a field for each port."""
-    made = cast("type[Any]", namedtuple("Memory", names))
-    made.holds_memories = True
-    return made
+    memory_type = cast("type[Any]", namedtuple("Memory", names))
+    memory_type.holds_memories = True
+    return memory_type
 
 
 def bind_port(name: str, law: Function, remembers: bool, memory: type[Any]) -> Function:
@@ -81,12 +81,12 @@ def bind_port(name: str, law: Function, remembers: bool, memory: type[Any]) -> F
 
 def bind_shifts(shifts: Iterable[tuple[str, Function]], memory: type[Any]) -> Function:
     """`(m, moved)`: the memories after the controlled body was moved, by the shift of each port that has one."""
-    made = {f"shift_{name}": shift for name, shift in shifts}
-    if not made:
+    functions = {f"shift_{name}": shift for name, shift in shifts}
+    if not functions:
         return keep_memory
-    own = ", ".join(f"shift_{field}(m.{field}, moved)" if f"shift_{field}" in made else f"m.{field}"
+    own = ", ".join(f"shift_{field}(m.{field}, moved)" if f"shift_{field}" in functions else f"m.{field}"
                     for field in memory._fields)
-    return write_function("shift_memories", "m, moved", [f"return Memory({own})"], Memory=memory, **made)
+    return write_function("shift_memories", "m, moved", [f"return Memory({own})"], Memory=memory, **functions)
 
 
 def chain_laws(laws: Iterable[tuple[Function, type[Any] | None]]) -> tuple[Function, Memory]:

@@ -59,10 +59,10 @@ class Quantity(NamedTuple):
         ('from 0 to 3600 s', 'above 0 and at most 1')
         """
         ends = {"from": self.low, "above": self.above, "at most": self.high, "below": self.below}
-        said = " and ".join(f"{word} {end if isinstance(end, int) else format(end, 'g')}"
+        text = " and ".join(f"{word} {end if isinstance(end, int) else format(end, 'g')}"
                             for word, end in ends.items() if math.isfinite(end))
-        said = said.replace(" and at most", " to") if self.low > -math.inf else said
-        return f"{said} {self.unit}" if said and self.unit != "1" else said
+        text = text.replace(" and at most", " to") if self.low > -math.inf else text
+        return f"{text} {self.unit}" if text and self.unit != "1" else text
 
 
 def list_quantities(group: type[Any]) -> Mapping[str, Quantity]:
@@ -79,7 +79,7 @@ _KNOWN_GROUPS: dict[type[Any], Mapping[str, Quantity]] = {}
 def make_group(name: str, meaning: str, fields: Mapping[str, Quantity], module: str, values: Iterable[float] = ()
                ) -> type[Any]:
     """A parameter group from a table of its fields; `module` has it as `name`, `values` are the nominal ones."""
-    made = cast("type[Any]", namedtuple(name, fields, defaults=values, module=module))
-    made.__annotations__ = {field: Annotated[float, q] for field, q in fields.items()}
-    made.__doc__ = meaning
-    return made
+    group = cast("type[Any]", namedtuple(name, fields, defaults=values, module=module))
+    group.__annotations__ = {field: Annotated[float, q] for field, q in fields.items()}
+    group.__doc__ = meaning
+    return group

@@ -100,9 +100,9 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
             work = partial(run, model.build_flat_state(), com, force, noise, record, steps or model.steps, out)
             run_beside(work) if fast else work()
     t = np.arange(len(com), dtype=np.float64) * model["controller.period"]
-    found = {s.name: out[:, i].copy() for i, s in enumerate(signals.columns)}
-    given = {"time": t, "command": com, "load": force}
-    columns = (found[s.name] if s.name in found else given[s.role] for s in signals)
+    outputs = {s.name: out[:, i].copy() for i, s in enumerate(signals.columns)}
+    inputs = {"time": t, "command": com, "load": force}
+    columns = (outputs[s.name] if s.name in outputs else inputs[s.role] for s in signals)
     return cast(Columns, make_columns_type(signals)(*columns))
 
 
@@ -157,36 +157,36 @@ def report_law_errors(model: Model) -> Iterator[None]:
     except Exception as error:
         if not model.effects and model.kind.file is None:
             raise
-        found = _find_law_error(model)
-        told = None if found else find_compile_error(error)
-        if told is not None:
-            raise told from error
-        where, cause = found or (model.kind.file or "effects", error)
+        law_error = _find_law_error(model)
+        compile_error = None if law_error else find_compile_error(error)
+        if compile_error is not None:
+            raise compile_error from error
+        where, cause = law_error or (model.kind.file or "effects", error)
         # s and c are names of the loops in plant.solve
-        unlike = re.search(r"Cannot unify (.+) and (.+) for '([sc])\b", str(cause).replace("float64", "number"))
-        if unlike:
-            raise InputError(where, "step" if unlike[3] == "s" else "control", "a function that gives back what it "
-                             f"gets, all fields written out: {unlike[1]}, not {unlike[2]}") from error
-        said = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")
+        mismatch = re.search(r"Cannot unify (.+) and (.+) for '([sc])\b", str(cause).replace("float64", "number"))
+        if mismatch:
+            raise InputError(where, "step" if mismatch[3] == "s" else "control", "a function that gives back what it "
+                             f"gets, all fields written out: {mismatch[1]}, not {mismatch[2]}") from error
+        message = next((line.strip() for line in reversed(str(cause).splitlines()) if line.strip()), "")
         raise InputError(where, ", ".join(model.effects),
-                         f"laws that can be compiled and run ({type(cause).__name__}: {said})") from error
+                         f"laws that can be compiled and run ({type(cause).__name__}: {message})") from error
 
 
 def find_compile_error(error: Exception) -> InputError | None:
     """The line of a user's file that numba cannot compile, as bad input; None if the error is not of that kind."""
     if type(error).__module__.partition(".")[0] != "numba":
         return None
-    text, own = str(error), str(Path(__file__).parents[1])
-    found = [*re.findall(r"at (/.+?) \((\d+)\)", text), *re.findall(r'File "(.+?)", line (\d+)', text)]
-    places = [(path, line) for file, line in found for path in [str(Path(file).resolve())]
-              if not path.startswith(own) and "site-packages" not in path]
+    text, root = str(error), str(Path(__file__).parents[1])
+    frames = [*re.findall(r"at (/.+?) \((\d+)\)", text), *re.findall(r'File "(.+?)", line (\d+)', text)]
+    places = [(path, line) for file, line in frames for path in [str(Path(file).resolve())]
+              if not path.startswith(root) and "site-packages" not in path]
     if not places:
         return None
     call = re.search(r">>> (.+)", text)  # of a function that it does not know for such arguments
     lines = (line.strip() for line in text.splitlines())
-    said = f"not {call[1]}, see docs/effects.md" if call else next(
+    message = f"not {call[1]}, see docs/effects.md" if call else next(
         (line for line in lines if line and not line.startswith(("Failed in", "During"))), "")
-    return InputError(f"{places[0][0]}:{places[0][1]}", "", f"Python that can be compiled ({said})")
+    return InputError(f"{places[0][0]}:{places[0][1]}", "", f"Python that can be compiled ({message})")
 
 
 def _find_law_error(model: Model) -> tuple[str, Exception] | None:
@@ -221,9 +221,9 @@ class Demand:
         """The demand that the loop closes on, m, from the demand and the sensed position, m."""
         if self._law is None:
             return demand
-        taken, self._memory = self._law(demand, self._memory, position, self._cycle * self._period, self._record)
+        loop_demand, self._memory = self._law(demand, self._memory, position, self._cycle * self._period, self._record)
         self._cycle += 1
-        return float(taken)
+        return float(loop_demand)
 
 
 def find_direct_readings(model: Model) -> list[tuple[int, int]]:
@@ -231,12 +231,12 @@ def find_direct_readings(model: Model) -> list[tuple[int, int]]:
 
     Empty where a reading is more than a field of the state with noise: something computed, or with an effect on it.
     """
-    shown, outputs = model.kind.find_shown_fields(), model.kind.signals.outputs
-    if shown is None or not all(s.noise for s in outputs) or any(
+    field_numbers, outputs = model.kind.find_shown_fields(), model.kind.signals.outputs
+    if field_numbers is None or not all(s.noise for s in outputs) or any(
             model.find_effect(e).port == "reading" for e in model.effects):
         return []
     index = {name: i for i, name in enumerate(model.list_names())}
-    return list(zip(shown, (index[s.noise] for s in outputs), strict=True))
+    return list(zip(field_numbers, (index[s.noise] for s in outputs), strict=True))
 
 
 class Actuator:

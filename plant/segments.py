@@ -278,11 +278,12 @@ def resample_on_cycles(t: Array, values: Array, period: float) -> Array:
     lasts as long as the one before it, if these are samples, or one cycle.
     """
     gaps = np.diff(t)
-    held = gaps <= (1 + SLACK) / RATE
-    tail = gaps[-1] if len(gaps) and held[-1] else period
+    is_sample = gaps <= (1 + SLACK) / RATE
+    tail = gaps[-1] if len(gaps) and is_sample[-1] else period
     cycles = max(1, ceil((t[-1] - t[0] + tail) / period - SLACK))
     grid = t[0] + np.arange(cycles) * period
     row = np.searchsorted(t, grid + SLACK * min(period, 1 / RATE), side="right") - 1
     lines = np.interp(grid, t, values)
-    samples: Array = np.where(np.append(held, True)[row] | (np.abs(grid - t[row]) < SLACK * period), values[row], lines)
-    return samples
+    demand: Array = np.where(np.append(is_sample, True)[row] | (np.abs(grid - t[row]) < SLACK * period), values[row],
+                             lines)
+    return demand

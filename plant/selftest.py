@@ -34,7 +34,7 @@ class Report(NamedTuple):
     @property
     def visible(self) -> bool:
         """Whether its largest size shows above the noise on the command of the test."""
-        return any(shown.level >= 1.0 for shown in self.shown)
+        return any(size.level >= 1.0 for size in self.shown)
 
 
 def check_effect(name: str, command: Array, load: Array | None = None, plant: str = "eha") -> Report:
@@ -50,10 +50,10 @@ def check_effect(name: str, command: Array, load: Array | None = None, plant: st
     starts = find_starts(effect, command, load, plant)
     change = (compute_changes(effect, starts, command, load, plant) if starts else
               np.zeros((0, len(command), len(outputs))))
-    shown = tuple(Shown(dict(start), dict(zip((s.name for s in outputs), sizes, strict=True)), most)
-                  for start, sizes, most in zip(starts, compute_rms(change).tolist(), compute_levels(
+    rows = tuple(Shown(dict(start), dict(zip((s.name for s in outputs), sizes, strict=True)), most)
+                 for start, sizes, most in zip(starts, compute_rms(change).tolist(), compute_levels(
                       change, plant).max(axis=1, initial=0.0).tolist(), strict=True))
-    return Report(name, tuple(_find_faults(effect, starts, command, load, plant)), shown)
+    return Report(name, tuple(_find_faults(effect, starts, command, load, plant)), rows)
 
 
 def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], command: Array, load: Array | None,
@@ -68,12 +68,12 @@ def _find_faults(effect: Effect, starts: tuple[Mapping[str, float], ...], comman
                for start in (*starts, *list_extremes(effect))
                if not np.isfinite(np.array(simulate(off.replace(start), command, load))).all()]
     if starts and not faults:
-        model, said = off.replace(starts[-1]), _format_values(starts[-1])
+        model, start_text = off.replace(starts[-1]), _format_values(starts[-1])
         if not _are_equal(*(simulate(model, command, load) for _ in range(2))):
-            faults.append(f"with {said} two runs of one seed differ")
+            faults.append(f"with {start_text} two runs of one seed differ")
         steps, short = 20, SHORT * np.abs(command).max()  # plain Python runs too
         if not _are_equal(*(simulate(model, short, steps=steps, fast=fast) for fast in (True, False))):
-            faults.append(f"with {said} compiled code and plain Python differ")
+            faults.append(f"with {start_text} compiled code and plain Python differ")
     return faults
 
 

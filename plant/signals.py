@@ -62,22 +62,22 @@ class Signal(NamedTuple):
 class Signals(tuple[Signal, ...]):
     """The signals of one plant in the order of its columns, `t` first."""
 
-    def __new__(cls, *declared: Signal) -> Self:
+    def __new__(cls, *signals: Signal) -> Self:
         """The signals with time in front.
 
         Raises:
             InputError: two of one name, an unknown role, or not exactly one command, one drive and at least one output.
         """
-        made = super().__new__(cls, (Signal("t", "t", "s", "time", "time"), *declared))
-        for s in made:
+        self = super().__new__(cls, (Signal("t", "t", "s", "time", "time"), *signals))
+        for s in self:
             require(s.role in ROLES, f"signal {s.name}", "role", f"one of {', '.join(ROLES[1:])}, not {s.role!r}")
-            require(sum(other.name == s.name for other in made) == 1, f"signal {s.name}", "name",
+            require(sum(other.name == s.name for other in self) == 1, f"signal {s.name}", "name",
                     "a name that no other signal has")
         for role, most in (("time", 1), ("command", 1), ("drive", 1), ("load", 1), ("output", 99)):
-            found = [s.name for s in made if s.role == role]
-            require(len(found) <= most and (found or role == "load"), "signals", "",
-                    f"{'one signal' if most == 1 else 'signals'} of role {role}, not {', '.join(found) or 'none'}")
-        return made
+            names = [s.name for s in self if s.role == role]
+            require(len(names) <= most and (names or role == "load"), "signals", "",
+                    f"{'one signal' if most == 1 else 'signals'} of role {role}, not {', '.join(names) or 'none'}")
+        return self
 
     def __getnewargs__(self) -> tuple[Signal, ...]:
         """As a worker process hands it on."""

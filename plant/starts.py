@@ -49,14 +49,14 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None, plant
     usual = {name: effect.off.get(name, find_plant(plant).nominal.get(name, 0.0)) for name in effect.fitted}
     sized = {name: sizes for name, off in usual.items()
              if (sizes := _find_sizes(effect, name, off, command, load, plant))}
-    found = [usual | {name: size} for name, sizes in sized.items() for size in sizes]
+    starts = [usual | {name: size} for name, sizes in sized.items() for size in sizes]
     for name, value in usual.items():
         if name not in sized:
             quantity = effect.parameters[name]
             usually = [factor * value for factor in SHAPES] if value or quantity.unit != "rad" else QUARTERS
             shapes = parse_hint(quantity) or [_clip_to_range(quantity, x) for x in usually]
-            found = [start | {name: shape} for start in found for shape in dict.fromkeys(shapes)]
-    return tuple(found)
+            starts = [start | {name: shape} for start in starts for shape in dict.fromkeys(shapes)]
+    return tuple(starts)
 
 
 def lacks_starts(effect: Effect, kind: Plant) -> bool:
@@ -93,11 +93,11 @@ def _resize_starts(effect: Effect, command: Array, load: Array | None, plant: st
     A deviation of the controlled signal, or of its demand, is at most a tenth of the largest demand.
     """
     unhinted = {name: q._replace(typical="") for name, q in effect.parameters.items()}  # typical of the other plant
-    found = find_starts(replace(effect, starts=(), parameters=unhinted), command, load, plant)
-    shown = compute_levels(compute_changes(effect, effect.starts, command, load, plant), plant).max(axis=1)
-    found += tuple(start for start, level in zip(effect.starts, shown, strict=True) if VISIBLE[0] <= level < np.inf)
+    starts = find_starts(replace(effect, starts=(), parameters=unhinted), command, load, plant)
+    levels = compute_levels(compute_changes(effect, effect.starts, command, load, plant), plant).max(axis=1)
+    starts += tuple(start for start, level in zip(effect.starts, levels, strict=True) if VISIBLE[0] <= level < np.inf)
     unit, most = find_plant(plant).signals.controlled.unit, 0.1 * np.abs(command).max()
-    return tuple(start for start in found
+    return tuple(start for start in starts
                  if all(abs(x) <= most for name, x in start.items() if effect.parameters[name].unit == unit))
 
 
@@ -153,9 +153,9 @@ def compute_levels(change: Array, plant: str = "eha") -> Array:
 def _compute_firmware_changes(model: Model, values: Sequence[Mapping[str, float]], com: Array, readings: Array
                               ) -> Array:
     out = np.zeros((len(values) + 1, *readings.shape))
-    for row, changed in zip(out, ({}, *values), strict=True):
+    for row, changes in zip(out, ({}, *values), strict=True):
         with report_law_errors(model):
-            row[:, 0] = compute_answers(model.replace(changed), com, readings)
+            row[:, 0] = compute_answers(model.replace(changes), com, readings)
     return (out[1:] - out[:1]) / model.values.get("controller.proportional_gain", 1.0)
 
 
@@ -170,23 +170,23 @@ def _find_sizes(effect: Effect, name: str, off: float, command: Array, load: Arr
 
     if hints := parse_hint(quantity):
         return hints if find_highest_level(np.array(hints)).max() > 0.0 else []
-    found: list[float] = []
+    sizes: list[float] = []
     for sign in (1.0, -1.0):
         decades = off + sign * np.logspace(*DECADES, DECADES[1] - DECADES[0] + 1)
         if effect.base and off:  # a stiffness that is lost is a fraction that nears 0
             decades = off * (1.0 + np.logspace(-4.0, 3.0, 15)) ** sign
         decades = decades[[not quantity.refuses(x) for x in decades]]
-        shown = find_highest_level(decades) if len(decades) else decades
+        levels = find_highest_level(decades) if len(decades) else decades
         for level in VISIBLE:
-            above = np.flatnonzero(shown >= level)
+            above = np.flatnonzero(levels >= level)
             if not len(above):
                 break
             i = above[0]
             finer = off + sign * np.geomspace(abs(decades[max(i - 1, 0)] - off), abs(decades[i] - off), 9)
             distance = np.abs(np.log(np.clip(find_highest_level(finer), 1e-9, 1e9) / level))
             if distance.min() < np.log(10.0):  # further off the simulation diverges
-                found.append(float(finer[distance.argmin()]))
-    return list(dict.fromkeys(found))
+                sizes.append(float(finer[distance.argmin()]))
+    return list(dict.fromkeys(sizes))
 
 
 def parse_hint(quantity: Quantity) -> list[float]:
@@ -197,11 +197,11 @@ def parse_hint(quantity: Quantity) -> list[float]:
     >>> parse_hint(Quantity("N m", low=0, typical="1-4 kN m at rest"))
     [1000.0, 2000.0, 4000.0]
     """
-    said = _RANGE.match(quantity.typical)
-    if not said:
+    match = _RANGE.match(quantity.typical)
+    if not match:
         return []
-    low, high = float(said[1]), float(said[2])
-    unit = " ".join(said[3].split()[:len(quantity.unit.split())])  # more words may follow: 1-5 % of Imax
+    low, high = float(match[1]), float(match[2])
+    unit = " ".join(match[3].split()[:len(quantity.unit.split())])  # more words may follow: 1-5 % of Imax
     if quantity.unit == "1":
         factor = 0.01 if unit == "%" else 1.0
     elif unit.endswith(quantity.unit) and unit.removesuffix(quantity.unit) in PREFIXES:

@@ -106,8 +106,8 @@ def parse_table(text: str, file: str) -> tuple[dict[str, Any], Place]:
             raise RecursionError
         return tables, Place(file, text)
     except tomllib.TOMLDecodeError as error:
-        found = re.fullmatch(r"(.*) \(at (?:line (\d+), column \d+|end of document)\)", str(error), re.DOTALL)
-        message, line = (found[1], found[2] or text.count("\n") + 1) if found else (str(error), 1)
+        match = re.fullmatch(r"(.*) \(at (?:line (\d+), column \d+|end of document)\)", str(error), re.DOTALL)
+        message, line = (match[1], match[2] or text.count("\n") + 1) if match else (str(error), 1)
         raise InputError(f"{file}:{line}", "", f"TOML; {message[:1].lower()}{message[1:]}") from error
     except ValueError as error:  # of tomllib too: Python reads no decimal number that is longer
         raise InputError(file, "", "TOML with whole numbers of at most 4300 digits") from error
@@ -115,46 +115,46 @@ def parse_table(text: str, file: str) -> tuple[dict[str, Any], Place]:
         raise InputError(file, "", "TOML with fewer levels of brackets or parts of a key") from error
 
 
-def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | None = None, **given: Any) -> T:
+def build_dataclass(cls: type[T], table: object, place: Place, kinds: Kinds | None = None, **constants: Any) -> T:
     """A `cls` from the table at `place`; raises InputError for a key or value it cannot be made from.
 
-    `given`: fields that are no keys.
+    `constants`: fields that are no keys.
     """
     kinds = kinds or {}
     if not isinstance(table, dict):
         raise place.refuse("a table")
-    pairs, made = dict(table), given
+    pairs = dict(table)
     if cls in kinds:
         kind = pairs.pop("kind", None)
         if not isinstance(kind, str) or kind not in kinds[cls]:
             raise (place.at("kind") if kind is not None else place).refuse(f"a kind: {list_choices(kind, kinds[cls])}")
         cls = kinds[cls][kind]
-        made |= {f.name: kind for f in fields(cls) if f.name == "kind"}  # type: ignore[arg-type]
+        constants |= {f.name: kind for f in fields(cls) if f.name == "kind"}  # type: ignore[arg-type]
     hints = get_type_hints(cls, include_extras=True)
-    known = {f.name: f for f in fields(cls) if f.metadata.get("key", True)}  # type: ignore[arg-type]
+    keys = {f.name: f for f in fields(cls) if f.metadata.get("key", True)}  # type: ignore[arg-type]
     for key in pairs:
-        if key not in known:
-            raise place.at(key).refuse(f"a key: {list_choices(key, known)}")
-    for key, f in known.items():
+        if key not in keys:
+            raise place.at(key).refuse(f"a key: {list_choices(key, keys)}")
+    for key, f in keys.items():
         if key not in pairs and f.default is MISSING and f.default_factory is MISSING:
             raise place.refuse(f"also the key {key!r}, {describe_annotation(hints[key])}")
     values = {key: _convert(value, hints[key], place.at(key), kinds) for key, value in pairs.items()}
     with place.locate(has_field=True):  # the class knows what is wrong with which field, not where it stands
-        return cls(**made, **values)
+        return cls(**constants, **values)
 
 
-def list_choices(word: object, known: Iterable[str]) -> str:
+def list_choices(word: object, choices: Iterable[str]) -> str:
     """The words that would have done in place of `word`, and the one that was probably meant.
 
     >>> list_choices("hodl", ["hold", "step"])
     "'hold' or 'step', not 'hodl' (did you mean 'hold'?)"
     """
-    names = sorted(known)
-    listed = " or ".join(filter(None, (", ".join(map(repr, names[:-1])), "".join(map(repr, names[-1:])))))
+    names = sorted(choices)
+    listing = " or ".join(filter(None, (", ".join(map(repr, names[:-1])), "".join(map(repr, names[-1:])))))
     if word is None:
-        return listed
+        return listing
     close = get_close_matches(word, [n for n in names if isinstance(n, str)], 1) if isinstance(word, str) else []
-    return f"{listed}, not {show_value(word)}" + (f" (did you mean {close[0]!r}?)" if close else "")
+    return f"{listing}, not {show_value(word)}" + (f" (did you mean {close[0]!r}?)" if close else "")
 
 
 def _convert(value: Any, hint: Any, place: Place, kinds: Kinds) -> Any:

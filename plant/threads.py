@@ -18,8 +18,8 @@ R = TypeVar("R")
 
 def count_threads() -> int:
     """One thread per core, or OMP_NUM_THREADS, by which a cluster tells its workers to share a machine."""
-    said = os.environ.get("OMP_NUM_THREADS", "")
-    return max(1, int(said)) if said.isdecimal() else os.cpu_count() or 1
+    setting = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, int(setting)) if setting.isdecimal() else os.cpu_count() or 1
 
 
 @contextlib.contextmanager

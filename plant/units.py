@@ -87,9 +87,9 @@ def parse_quantity(text: str, si: str, place: Place) -> Fraction:
     Raises:
         InputError: no number, no unit, or the unit of another quantity.
     """
-    found = _QUANTITY.fullmatch(text)
-    if found is None or bool(found[2]) != bool(si):
+    match = _QUANTITY.fullmatch(text)
+    if match is None or bool(match[2]) != bool(si):
         expected = f"a number and a unit, such as '1 {si}'" if si else "a number without a unit"
         raise place.refuse(f"{expected}, not {show_value(text)}")
     with place.locate():
-        return Fraction(found[1]) * (require_unit(found[2], si, "", "").factor if si else 1)
+        return Fraction(match[1]) * (require_unit(match[2], si, "", "").factor if si else 1)
