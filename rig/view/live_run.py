@@ -50,14 +50,14 @@ class LivePlan(NamedTuple):
 
 def make_live_plan(sequence: Sequence, pace: str, bench: Bench) -> LivePlan:
     """The plan of a sequence; checks that cannot be sent to another process (Python of a user) keep their names."""
-    known, unknown = [], []
+    checks, unknown_checks = [], []
     for check in sequence.checks:
         try:
             pickle.dumps(check)
-            known.append(check)
+            checks.append(check)
         except (pickle.PicklingError, AttributeError, TypeError):
-            unknown.append(check.name)
-    return LivePlan(sequence.title, sequence.duration, sequence.rate, pace, tuple(known), tuple(unknown),
+            unknown_checks.append(check.name)
+    return LivePlan(sequence.title, sequence.duration, sequence.rate, pace, tuple(checks), tuple(unknown_checks),
                     sequence.sections(), dict(sequence.fault_starts()), bool(sequence.load),
                     bench.list_participants(), signals=bench.signals)
 

@@ -44,8 +44,8 @@ def build_effects_report(effects: Sequence[Effect], plant: str, tests: Mapping[s
     for name, test in tests.items():
         row = next(row for row in rows if row["effect"] == name)
         row["self_test"] = {"faults": list(test.faults), "visible": test.visible,
-                            "shown": [{"start": shown.start, **shown.changes, "level": shown.level}
-                                      for shown in test.shown]}
+                            "shown": [{"start": size.start, **size.changes, "level": size.level}
+                                      for size in test.shown]}
     title, sentence = "effects", ""
     if is_detailed:
         law = ((effects[0].function.__doc__ if effects[0].function else "") or "").partition("\n")[0]
@@ -102,9 +102,9 @@ def _show_test(test: SelfTest, plant: str) -> Iterator[Item]:
     """The faults that a self-test found, and what each size changes."""
     if test.shown:
         units = {s: CONVENIENT.get(s.unit, (1.0, s.unit)) for s in find_plant(plant).signals.outputs}
-        rows = [[", ".join(f"{name.partition('.')[2]} = {value:.3g}" for name, value in shown.start.items()),
-                 *(format_digits(shown.changes[s.name] * factor) for s, (factor, _) in units.items()),
-                 format_digits(shown.level)] for shown in test.shown]
+        rows = [[", ".join(f"{name.partition('.')[2]} = {value:.3g}" for name, value in size.start.items()),
+                 *(format_digits(size.changes[s.name] * factor) for s, (factor, _) in units.items()),
+                 format_digits(size.level)] for size in test.shown]
         columns = [Column("size"), *(Column(s.symbol, unit, "right") for s, (_, unit) in units.items()),
                    Column("over noise", align="right")]
         yield Table(columns, rows, f"What {test.effect} changes: RMS over the nominal test, driven by the "
