@@ -4,7 +4,6 @@ import argparse
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from importlib.resources import files
 from keyword import iskeyword
 from pathlib import Path
@@ -40,8 +39,7 @@ def run_command(args: argparse.Namespace) -> int:
         problem = ""
     except InputError as error:
         problem = str(error)
-    report = build_new_report(path, text, problem)
-    return give_answer(replace(report, next_command=check, files=[(args.kind, str(path))]), args)
+    return give_answer(build_new_report(args.kind, path, text, problem, check), args)
 
 
 def write_example(path: Path, args: argparse.Namespace, plant: Plant, check: str) -> str:
@@ -100,15 +98,15 @@ def _name_from(path: Path, file: str | Path) -> str:
     return Path(os.path.relpath(file, path.parent)).as_posix()
 
 
-def build_new_report(path: Path, text: str, problem: str) -> Report:
-    """Report on a file that was written: what is unsure in it, and what is missing."""
+def build_new_report(kind: str, path: Path, text: str, problem: str, check: str) -> Report:
+    """Report on a file that was written: what is unsure in it, what is missing, and the command that checks it."""
     unsure_lines = [line.strip() for line in text.splitlines() if UNSURE in line]
     unsure = "; check what it marks as unsure" if unsure_lines else ""
     sentence = f"{path} is to be completed: {problem}" if problem else f"{path} can be used{unsure}."
     return Report("new", str(path), "INCOMPLETE" if problem else "COMPLETE", "doubtful" if problem else "good",
                   sentence, sections=[Section("Unsure", [Line("unsure", line) for line in unsure_lines])],
                   data={"verdict": "INCOMPLETE" if problem else "COMPLETE", "file": str(path), "problem": problem,
-                        "unsure": unsure_lines})
+                        "unsure": unsure_lines}, next_command=check, files=[(kind, str(path))])
 
 
 EXAMPLES = {"plant": ("plant", "models", "new_plant.py"), "effect": ("rig.cli", "new_effect.txt"),
