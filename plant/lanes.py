@@ -178,7 +178,7 @@ class Lanes:
         for name in self.names:
             require(name in parameter_names and name != "controller.period", "lanes", name,
                     f"a parameter of the model {model.name} other than the period")
-        self._rungs = list_kernel_variants(model)
+        self._variants = list_kernel_variants(model)
         self._own: dict[tuple[str, ...], KernelVariant] = {}
 
     def replay(self, values: Array, current: Array, load: Array, position: Array | None = None,
@@ -307,8 +307,8 @@ class Lanes:
                 "lanes", "load", "one number a cycle in each input, not shapes "
                 f"{driven.shape}, {load.shape} and {position.shape}")
         slack = 0.0 if self.model.kind.correct is None else float(slack)
-        shares = [Share(rung, self.names, values[members], members)
-                  for rung, members in self._assign_runs(values, len(driven))]
+        shares = [Share(variant, self.names, values[members], members)
+                  for variant, members in self._assign_runs(values, len(driven))]
         period = float(self.model["controller.period"])
         return shares, (driven, load, position, float(anchor), slack, is_closed, period, self.steps)
 
@@ -318,17 +318,17 @@ class Lanes:
         `samples` is the length of a run.
         """
         effects = self.model.effects
-        if len(self._rungs) == 1:
-            return [(self._rungs[0], np.arange(len(values)))]
+        if len(self._variants) == 1:
+            return [(self._variants[0], np.arange(len(values)))]
         at_work = np.column_stack([self._find_active_runs(self.model.find_effect(name), values) for name in effects])
         is_left, assignments = np.ones(len(values), bool), []
-        for rung in self._rungs:
-            is_missing = [name not in rung.model.effects for name in effects]
+        for variant in self._variants:
+            is_missing = [name not in variant.model.effects for name in effects]
             fits = is_left & ~at_work[:, is_missing].any(axis=1)
             is_left &= ~fits
             if fits.any():
-                assignments.append((rung, np.flatnonzero(fits)))
-        if assignments and assignments[-1][0] is self._rungs[-1]:
+                assignments.append((variant, np.flatnonzero(fits)))
+        if assignments and assignments[-1][0] is self._variants[-1]:
             _, members = assignments.pop()
             assignments += self._share_costly_runs(members, at_work, samples)
         return assignments
@@ -342,7 +342,7 @@ class Lanes:
             at_work: (m, effects) of all runs.
             samples: of a run.
         """
-        cheap = self._rungs[-2].model.effects
+        cheap = self._variants[-2].model.effects
         costly = [name for name in self.model.effects if name not in cheap]
         columns = [self.model.effects.index(name) for name in costly]
         kinds, kind_of, sizes = np.unique(at_work[members][:, columns], axis=0, return_inverse=True,
@@ -359,7 +359,7 @@ class Lanes:
                 assignments.append((kernel, members[is_of_kind]))
                 is_left &= ~is_of_kind
         if is_left.any():
-            assignments.append((self._rungs[-1], members[is_left]))
+            assignments.append((self._variants[-1], members[is_left]))
         return assignments
 
     def _find_own_kernel(self, effects: tuple[str, ...]) -> KernelVariant:
@@ -457,10 +457,11 @@ def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambd
     `progress` is called with each stage and the share done.
     The first time this takes some 3 s without effects and 15 s with the whole catalogue, later half a second.
     """
-    rungs = list_kernel_variants(model)
-    for done, rung in enumerate(rungs):
-        progress(f"compiling the plant with {count_nouns(len(rung.model.effects), 'effect')}, once", done / len(rungs))
-        rung.prepare()
+    variants = list_kernel_variants(model)
+    for done, variant in enumerate(variants):
+        progress(f"compiling the plant with {count_nouns(len(variant.model.effects), 'effect')}, once",
+                 done / len(variants))
+        variant.prepare()
     progress("", 1.0)
 
 

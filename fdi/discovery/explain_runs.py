@@ -161,7 +161,7 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
 def lean_model(model: Model, effects: Sequence[str]) -> Model:
     """The whole catalogue where its quick kernels have these effects; else a model of its own, worth its compiling."""
     whole_model, own_model = complete_model(model), silence_readings(model.with_effects(effects))
-    quick = {e for rung in list_kernel_variants(whole_model)[:-1] for e in rung.model.effects}
+    quick = {e for variant in list_kernel_variants(whole_model)[:-1] for e in variant.model.effects}
     return whole_model if set(own_model.effects) <= quick else own_model
 
 

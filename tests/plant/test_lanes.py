@@ -125,7 +125,7 @@ def test_each_effect_alone_among_all_that_are_off(catalogue: Lanes) -> None:
 
 def test_runs_go_to_the_kernel_with_the_fewest_effects(catalogue: Lanes, monkeypatch: pytest.MonkeyPatch) -> None:
     """And get the bits that the kernel with all effects would give them."""
-    none, cheap, every = (len(rung.model.effects) for rung in list_kernel_variants(catalogue.model))
+    none, cheap, every = (len(variant.model.effects) for variant in list_kernel_variants(catalogue.model))
     assert none == 0 and 10 < cheap < 20 and every == len(EFFECTS)
     assert len(list_kernel_variants(QUIET.with_effects(EFFECTS[:3]))) == 1
     at_work = [{}, *(start(effect, 0) for effect in ("null_bias", "stribeck", "rod_backlash", "orifice_root")), {}]
@@ -144,13 +144,13 @@ def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth
                         for kind in kinds for which in (0, -1)] * 4)
     monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
     without = catalogue.replay(values, CURRENT, FORCE)
-    assert {len(rung.model.effects) for rung, _ in catalogue._assign_runs(values, 1)} == {len(EFFECTS)}
+    assert {len(variant.model.effects) for variant, _ in catalogue._assign_runs(values, 1)} == {len(EFFECTS)}
     monkeypatch.setattr(kernel_use, "WORTH_LOADING", 0.0)
     monkeypatch.setattr(kernel_use, "WORTH_COMPILING", 0.0)
     monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
     shared = catalogue._assign_runs(values, 1)
-    assert {frozenset(rung.model.effects) & {"coil_lag", "viscosity_drift", "stribeck"} for rung, _ in shared} == {
-        frozenset({"coil_lag"})}
+    assert {frozenset(variant.model.effects) & {"coil_lag", "viscosity_drift", "stribeck"}
+            for variant, _ in shared} == {frozenset({"coil_lag"})}
     assert (catalogue.replay(values, CURRENT, FORCE) == without).all()
 
 
