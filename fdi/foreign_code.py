@@ -1,7 +1,7 @@
 """Code that a log or a model file brings along. It runs only if the user trusts it, and it is announced before.
 
 A recording, a model file and a folder of results are data that people send to each other. What they contain must not
-run on the machine of the person who opens them. A file that the user names on the command line is his own choice.
+run on the machine of the person who opens them. A file on the command line is the user's own choice.
 """
 
 import hashlib

@@ -205,7 +205,7 @@ class _Reader:
         return decode_device_text(self.read_file(name, place))
 
     def find_checksum(self, kind: str, place: Place) -> str:
-        """The name of a checksum for `Field.checksum`; a file of the user's runs, if he trusts it."""
+        """The name of a checksum for `Field.checksum`; a file of the user's runs, if the user trusts it."""
         file, _, function = kind.rpartition(":")
         if kind in CHECKSUMS or not file.endswith(".py"):
             place.require(kind in CHECKSUMS,

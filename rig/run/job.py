@@ -332,11 +332,11 @@ def load_tested_model(choice: JobChoice, *, is_trusted: bool = False, announce: 
 
 def build_job(choice: JobChoice, sequence: Sequence | None = None, *, is_trusted: bool = False,
               announce: Announce = print_on_standard_error) -> Job:
-    """The job that a user chose; his model and changes override the sequence's own.
+    """The job that a user chose; the model and the changes chosen override the sequence's own.
 
     Args:
-        choice: what he chose.
-        sequence: given if it is not to be read from the file that he chose.
+        choice: of the user.
+        sequence: given where it is not to be read from the chosen file.
         is_trusted: whether effect files that a model file names may run.
         announce: gets a line about each of these before it runs.
 
