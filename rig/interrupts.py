@@ -74,8 +74,9 @@ def exit_on_signal(number: int, frame: FrameType | None) -> None:
     """End by an exception, so that `subprocess.run` ends its own process, too.
 
     It is raised again and again until the process has ended: Python drops an exception that comes in a destructor or in
-    a function that compiled code calls, as the compiler does.
+    a function that compiled code calls, as the compiler does. What it prints then is of no use to anybody.
     """
+    sys.unraisablehook = lambda unraisable: None
     signal.signal(signal.SIGALRM, exit_on_signal)
     signal.setitimer(signal.ITIMER_REAL, 0.3)
     raise SystemExit(128 + signal.SIGTERM)

@@ -126,19 +126,22 @@ def test_a_second_ctrl_c_ends_it_and_the_log_is_closed_all_the_same(tmp_path: Pa
     assert Trace.read(tmp_path / "out", all=True).events[-1].text == "end"
 
 
-def test_ctrl_c_is_not_lost_where_python_ignores_exceptions() -> None:
-    """As in the locks of imports, in which a command spends much of its first second."""
-    program = """if True:
+@pytest.mark.parametrize(("number", "prepare", "error"), [
+    ("SIGINT", "repeat_lost_interrupts()", "KeyboardInterrupt"),
+    ("SIGTERM", "signal.signal(signal.SIGTERM, exit_on_signal)", "SystemExit")])
+def test_a_signal_is_not_lost_where_python_ignores_exceptions(number: str, prepare: str, error: str) -> None:
+    """As in the locks of imports, in which a command spends much of its first second. Nothing is said of it."""
+    program = f"""if True:
         import os, signal, time
-        from rig.interrupts import repeat_lost_interrupts
+        from rig.interrupts import exit_on_signal, repeat_lost_interrupts
         class Lock:
             def __del__(self):
-                os.kill(os.getpid(), signal.SIGINT)
-        repeat_lost_interrupts()
+                os.kill(os.getpid(), signal.{number})
+        {prepare}
         try:
             Lock()
             time.sleep(600.0)
-        except KeyboardInterrupt:
+        except {error}:
             print("heard")"""
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300.0, check=False)
     assert (done.stdout, done.stderr) == ("heard\n", "")
