@@ -42,9 +42,9 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
         monkeypatch.setattr(benchmarks, f"measure_{name}", lambda value=value: value)
     words = " ".join(rig("bench").out.split())
     assert "C skipped: gcc is not installed; to get it: apt-get install gcc" in words
-    told = answer("bench", "--out", tmp_path / "b.json")
-    assert told == json.loads((tmp_path / "b.json").read_text()) and told["times_real_time"] > 0 < told["cycle"]
-    assert (told["run_process"], told["help_process"]) == (6.0, 0.1)
+    report = answer("bench", "--out", tmp_path / "b.json")
+    assert report == json.loads((tmp_path / "b.json").read_text()) and report["times_real_time"] > 0 < report["cycle"]
+    assert (report["run_process"], report["help_process"]) == (6.0, 0.1)
 
 
 def test_whole_processes_are_timed() -> None:
@@ -86,9 +86,9 @@ def test_the_responder_in_c_sends_the_frames_of_the_emulator(where: str) -> None
 def test_percentiles_ratios_and_targets() -> None:
     count = 10_001
     us = np.linspace(0.0, 100.0, count) * 1e-6
-    answered = {"lateness": us, "feedback_response": 2 * us, "valve_response": 3 * us, "execution": us}
-    times = {CYCLICTEST: {"lateness": us}, COMPILED: answered | {"feedback_response": 2.2 * us},
-             IN_C: answered, "another": answered | {"feedback_response": np.where(us > 90e-6, np.nan, us)}}
+    samples = {"lateness": us, "feedback_response": 2 * us, "valve_response": 3 * us, "execution": us}
+    times = {CYCLICTEST: {"lateness": us}, COMPILED: samples | {"feedback_response": 2.2 * us},
+             IN_C: samples, "another": samples | {"feedback_response": np.where(us > 90e-6, np.nan, us)}}
     figures = summarise_contenders(times)
     assert figures["times_us"]["lateness"][CYCLICTEST] == pytest.approx(
         {"p50": 50, "p99": 99, "p99_9": 99.9, "max": 100})
@@ -97,7 +97,7 @@ def test_percentiles_ratios_and_targets() -> None:
     assert targets["feedback response p99, compiled / C"] == (pytest.approx(1.1), True)
     assert targets["lateness p50, compiled / cyclictest"] == (pytest.approx(1.0), True)
     assert targets["execution p99.9, compiled"] == (pytest.approx(99.9), True)
-    slower = summarise_contenders(times | {COMPILED: {name: 1.31 * each for name, each in answered.items()}})
+    slower = summarise_contenders(times | {COMPILED: {name: 1.31 * each for name, each in samples.items()}})
     assert not any(target["is_met"] for target in slower["targets"])
 
 
@@ -108,9 +108,9 @@ def test_the_command_measures_everybody(where: str) -> None:
     result = rig("bench", "realtime", "--bus", where, "--seconds", 0.5, "--blocks", 1, "--json")
     assert result.status in (0, 1) and result.err == ""
     figures = result.json
-    there = {COMPILED} | ({IN_C} if shutil.which("gcc") else set())
-    assert figures["times_us"]["feedback_response"].keys() == there
-    for name in there:
+    contenders = {COMPILED} | ({IN_C} if shutil.which("gcc") else set())
+    assert figures["times_us"]["feedback_response"].keys() == contenders
+    for name in contenders:
         assert figures["cycles"][name] >= 400 and figures["lost"][name] < figures["cycles"][name]
     if benchmarks.find_cyclictest():
         assert figures["times_us"]["lateness"][CYCLICTEST]["p50"] > 0
