@@ -19,11 +19,11 @@ EXAMPLES = sorted(ROOT.glob("examples/*/bench.toml"))
 
 def test_the_shipped_bench_has_the_frames_of_the_codec() -> None:
     bench = load_bench()
-    found = [Signal(spec.identifier, each.name, each.lowest, each.length, each.kind is Kind.SIGNED, float(each.count),
-                    {"position_demand": "m", "ram_position": "m", "spool_position": "m", "load_pressure": "Pa",
-                     "current": "A"}.get(each.name, ""))
-             for spec in bench.frames.frames for each in spec.fields]
-    assert sorted(found) == sorted(SIGNALS)
+    signals = [Signal(spec.identifier, each.name, each.lowest, each.length, each.kind is Kind.SIGNED, float(each.count),
+                      {"position_demand": "m", "ram_position": "m", "spool_position": "m", "load_pressure": "Pa",
+                       "current": "A"}.get(each.name, ""))
+               for spec in bench.frames.frames for each in spec.fields]
+    assert sorted(signals) == sorted(SIGNALS)
     assert bench.frames.sync == SYNC
     assert {spec.roles: (spec.name, spec.sender, spec.is_before_sync) for spec in bench.frames.frames} == {
         ("command",): ("RPDO1", Role.RIG, True), ("feedback",): ("RPDO2", Role.PLANT, False),

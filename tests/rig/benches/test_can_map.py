@@ -69,14 +69,14 @@ def draw_message(draw: st.DrawFn) -> Message:
     """What the rig sends, with at least two signals; pages 3 and 9 where it is multiplexed."""
     length = draw(st.sampled_from((4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)))
     if draw(st.booleans()):
-        signals = draw(draw_signals(0, length).filter(lambda found: len(found) > 1))
+        signals = draw(draw_signals(0, length).filter(lambda signals: len(signals) > 1))
     else:
         page = Signal("Page", 0, 8, is_multiplexer=True)
-        signals = draw(draw_signals(1, length, (3,)).filter(lambda found: len(found) > 1))
-        others = draw(draw_signals(1, length, (9,)))
-        for signal in others:
+        signals = draw(draw_signals(1, length, (3,)).filter(lambda signals: len(signals) > 1))
+        other_signals = draw(draw_signals(1, length, (9,)))
+        for signal in other_signals:
             signal.name = f"Other{signal.name}"
-        signals = [page, *signals, *others]
+        signals = [page, *signals, *other_signals]
     for signal, (unit, _) in zip([each for each in signals if each.name[0] == "S"], INPUTS.values(), strict=False):
         signal.unit = unit
     is_long = draw(st.booleans())
@@ -100,20 +100,20 @@ WRITE, READ = compile_function(pack_frame), compile_function(unpack_frame)
 
 def pack_compiled(spec: FrameSpec, values: dict[str, float]) -> bytes:
     """The bytes by the compiled tables of the sender."""
-    sent = make_layout([spec], list(values), Role.RIG)
-    first = int(sent.words[VALUES_AT])
-    sent.doubles[first: first + len(values)] = list(values.values())
-    WRITE(sent, FRAMES_AT, 0)
-    return sent.octets[8 * PAYLOAD: 8 * PAYLOAD + spec.length].tobytes()
+    layout = make_layout([spec], list(values), Role.RIG)
+    first = int(layout.words[VALUES_AT])
+    layout.doubles[first: first + len(values)] = list(values.values())
+    WRITE(layout, FRAMES_AT, 0)
+    return layout.octets[8 * PAYLOAD: 8 * PAYLOAD + spec.length].tobytes()
 
 
 def unpack_compiled(spec: FrameSpec, data: bytes) -> dict[str, float]:
     """The values that the compiled tables of the receiver read."""
     names = [each.name for each in spec.fields if each.name in INPUTS]
-    received = make_layout([spec], names, Role.CONTROLLER)
-    received.octets[8 * PAYLOAD: 8 * PAYLOAD + spec.length] = list(data)
-    assert READ(received, FRAMES_AT, spec.length, 0) == ACCEPTED
-    return dict(zip(names, received.doubles[int(received.words[VALUES_AT]):].tolist(), strict=False))
+    layout = make_layout([spec], names, Role.CONTROLLER)
+    layout.octets[8 * PAYLOAD: 8 * PAYLOAD + spec.length] = list(data)
+    assert READ(layout, FRAMES_AT, spec.length, 0) == ACCEPTED
+    return dict(zip(names, layout.doubles[int(layout.words[VALUES_AT]):].tolist(), strict=False))
 
 
 @settings(max_examples=50)
@@ -131,19 +131,20 @@ def test_frames_are_those_of_cantools(message: Message, data: st.DataObject) -> 
     encoded = bytes(message.encode(raw, scaling=False, padding=False))
     for each in (field for field in spec.fields if field.name in INPUTS and field.kind is not Kind.FLOAT):
         assert extract_bits(each, encoded) == raw[names[each.name]] % (1 << each.length)
-    known: Any = message.decode(encoded, decode_choices=False)
-    found = unpack(spec, encoded)
+    reference: Any = message.decode(encoded, decode_choices=False)
+    readings = unpack(spec, encoded)
     for name, signal in names.items():
-        if name in found:
-            assert found[name] == pytest.approx(known[signal] * INPUTS[name][1], rel=1e-12, abs=1e-9 * INPUTS[name][1])
+        if name in readings:
+            assert readings[name] == pytest.approx(
+                reference[signal] * INPUTS[name][1], rel=1e-12, abs=1e-9 * INPUTS[name][1])
     anything = st.one_of(st.sampled_from((0.0, 1.0, -1.5, 1e-3, 1e25, -1e25)), st.floats(-1e3, 1e3))
-    values = {name: data.draw(anything) for name in names if name in found}
+    values = {name: data.draw(anything) for name in names if name in readings}
     packed = pack(spec, values)
     assert pack_compiled(spec, values) == packed
-    assert all(unpack_compiled(spec, sent).items() <= unpack(spec, sent).items() for sent in (encoded, packed))
+    assert all(unpack_compiled(spec, payload).items() <= unpack(spec, payload).items() for payload in (encoded, packed))
     exact = {each.name for each in spec.fields if each.length <= 48 and each.kind is not Kind.FLOAT}
     if all(each.name in exact or each.fixed is not None for each in spec.fields):
-        assert pack(spec, found) == encoded
+        assert pack(spec, readings) == encoded
 
 
 def test_units_and_offsets_become_si_exactly() -> None:
@@ -251,11 +252,11 @@ def test_pages_of_a_multiplexer_are_those_of_cantools(state: str, pages: list[st
     for place, spec in zip(list_frame_places(layout), frames.frames, strict=True):
         message = database.get_message_by_name(spec.name.partition("[")[0])
         data = pack(spec, {"position_demand": 1e-3, "ram_position": -2e-4, "current": 4e-3})
-        known: Any = message.decode(data)
-        assert spec.name == f"{message.name}[{known['Kind']}]" and bytes(message.encode(known)) == data
+        reference: Any = message.decode(data)
+        assert spec.name == f"{message.name}[{reference['Kind']}]" and bytes(message.encode(reference)) == data
         for name, signal in (("Position", "position_demand"), ("Ram", "ram_position"), ("Current", "current")):
-            if name in known:
-                assert unpack(spec, data)[signal] == pytest.approx(1e-3 * known[name])
+            if name in reference:
+                assert unpack(spec, data)[signal] == pytest.approx(1e-3 * reference[name])
         layout.octets[8 * PAYLOAD: 8 * PAYLOAD + len(data)] = list(data)
         assert frames.find(spec.identifier, data) is spec and find_frame(layout, spec.identifier) == place
         assert spec.sent_as == message.frame_id | (FD | SWITCHED if message.length > 8 else 0)
@@ -291,12 +292,12 @@ def test_crcs_equal_the_tables_of_autosar(row: str, name: str, polynomial: int, 
         make_field(name), b"\xA5" + words[0], 0)
 
 
-@pytest.mark.parametrize("data_id, data, expected", [
+@pytest.mark.parametrize("data_id, data, checksum", [
     # AUTOSAR PRS E2E, profile 1, data ID mode "both": eight bytes of which one is the CRC and one holds the counter
     (0x123, "0000000000000000", 0xCC), (0x123, "0001000000000000", 0x91),
 ])
-def test_profile_1_equals_the_example_of_autosar(data_id: int, data: str, expected: int) -> None:
-    assert compute_checksum(make_field("e2e_profile_1", data_id=data_id), bytes.fromhex(data), 0) == expected
+def test_profile_1_equals_the_example_of_autosar(data_id: int, data: str, checksum: int) -> None:
+    assert compute_checksum(make_field("e2e_profile_1", data_id=data_id), bytes.fromhex(data), 0) == checksum
 
 
 @given(data=st.binary(min_size=2, max_size=64), ids=st.lists(st.integers(0, 255), min_size=16, max_size=16))
@@ -308,11 +309,11 @@ def test_profile_2_equals_that_of_cantools(data: bytes, ids: list[int]) -> None:
 
 @given(data=st.binary(min_size=1, max_size=8), crc=st.integers(0, 255))
 def test_what_stands_in_the_field_does_not_count(data: bytes, crc: int) -> None:
-    known = load_checksum("sums.py", b"def add(data, counter):\n    return sum(data) + counter\n", "add")
-    for name in ("crc8_sae_j1850", "crc8_h2f", "e2e_profile_1", known):
+    user_checksum = load_checksum("sums.py", b"def add(data, counter):\n    return sum(data) + counter\n", "add")
+    for name in ("crc8_sae_j1850", "crc8_h2f", "e2e_profile_1", user_checksum):
         each = make_field(name)
         assert compute_checksum(each, bytes([crc]) + data[1:], 3) == compute_checksum(each, data, 3)
-    assert compute_checksum(make_field(known), data, 3) == (sum(data[1:]) + 3) & 0xFF
+    assert compute_checksum(make_field(user_checksum), data, 3) == (sum(data[1:]) + 3) & 0xFF
 
 
 @pytest.mark.parametrize("source, error", [

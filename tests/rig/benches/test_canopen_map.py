@@ -60,25 +60,25 @@ def test_frames_are_those_of_canopen(pdos: list[list[tuple[int, int]]], data: st
         rpdos.append(Mapped(words, f"0x{0x205 + 0x10 * number:X}"))
     sheet = format_eds(objects, rpdos, [Mapped((0x2FFF_0020,), "0x181")])
     sheet = "[DummyUsage]\n" + "".join(f"Dummy{i:04}=1\n" for i in range(1, 8)) + "\n" + sheet
-    used = list(INPUTS.items())[:index - 0x2000]
+    inputs = list(INPUTS.items())[:index - 0x2000]
     lines = [f'{name} = {{ object = "0x{0x2000 + i:04X}"' + (f', count = "{count}"' if count else "") + " }"
-             for i, (name, count) in enumerate(used)]
+             for i, (name, count) in enumerate(inputs)]
     bench = load_bench_from_files({"b.toml": BENCH.format("\n".join(lines)).encode(), "x.eds": sheet.encode()})
     remote = canopen.RemoteNode(NODE, import_eds(io.StringIO(sheet), NODE))  # type: ignore[no-untyped-call]
     remote.associate_network(canopen.Network())
     remote.rpdo.read(from_od=True)
     maps: Any = {each.cob_id: each for each in remote.rpdo.values()}
     for spec in bench.frames.list_from(Role.RIG):
-        theirs = maps[spec.identifier]
-        places = {name: i for i, (name, _) in enumerate(used, 0x2000)}
-        named = [each for each in spec.fields if each.name]
-        for each in named:
+        pdo_map = maps[spec.identifier]
+        places = {name: i for i, (name, _) in enumerate(inputs, 0x2000)}
+        fields = [each for each in spec.fields if each.name]
+        for each in fields:
             numbers = st.integers(*each.range) if each.kind is not Kind.FLOAT else st.floats(width=32, allow_nan=False)
-            theirs[places[each.name]].raw = data.draw(numbers)
-        frame = bytes(theirs.data)
+            pdo_map[places[each.name]].raw = data.draw(numbers)
+        frame = bytes(pdo_map.data)
         assert len(frame) == spec.length
-        for each in named:
-            raw = theirs[places[each.name]].raw
+        for each in fields:
+            raw = pdo_map[places[each.name]].raw
             if each.kind is not Kind.FLOAT:
                 assert extract_bits(each, frame) == int(raw) & (1 << each.length) - 1
             assert unpack(spec, frame)[each.name] == pytest.approx(float(raw) * float(each.count), rel=1e-12)

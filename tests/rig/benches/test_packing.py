@@ -26,7 +26,7 @@ from rig.benches.packing import REPEATED, WRONG_CHECKSUM
 
 
 @pytest.fixture(scope="module")
-def compiled() -> tuple[object, object, object]:
+def functions() -> tuple[object, object, object]:
     return tuple(compile_function(one) for one in (pack_frame, unpack_frame, find_frame))
 
 
@@ -43,49 +43,49 @@ CHECKSUMS = [("crc8_sae_j1850", 0, ()), ("crc8_h2f", 0, ()), ("e2e_profile_1", 0
 
 
 @pytest.mark.parametrize(("checksum", "data_id", "data_ids"), CHECKSUMS)
-def test_alive_counter_and_checksum(checksum: str, data_id: int, data_ids: tuple[int, ...], compiled: tuple) -> None:
+def test_alive_counter_and_checksum(checksum: str, data_id: int, data_ids: tuple[int, ...], functions: tuple) -> None:
     """The sender computes both; the receiver takes no frame with a wrong checksum and none twice."""
-    write, read, _ = compiled
+    write, read, _ = functions
     fields = (Field(name="value", lowest=16, length=16),
               Field(name="count", lowest=8, length=4, guard=Guard.COUNTER, wrap=15),
               Field(name="crc", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=checksum, data_id=data_id,
                     data_ids=data_ids))
     spec = FrameSpec(name="frame", identifier=1, length=8, sender=Role.RIG, fields=fields)
-    sent, received = make_layout([spec], ["value"], Role.RIG), make_layout([spec], ["value"], Role.CONTROLLER)
+    sender, receiver = make_layout([spec], ["value"], Role.RIG), make_layout([spec], ["value"], Role.CONTROLLER)
     for number in range(40):
-        sent.doubles[sent.words[VALUES_AT]] = 7.0 * number
-        write(sent, FRAMES_AT, 0)
-        data = read_payload(sent, spec)
+        sender.doubles[sender.words[VALUES_AT]] = 7.0 * number
+        write(sender, FRAMES_AT, 0)
+        data = read_payload(sender, spec)
         assert data == pack(spec, {"value": 7.0 * number}, number)
-        write_payload(received, data)
-        assert read(received, FRAMES_AT, 8, 0) == ACCEPTED
-        write_payload(received, data)
-        assert read(received, FRAMES_AT, 8, 0) == REPEATED
+        write_payload(receiver, data)
+        assert read(receiver, FRAMES_AT, 8, 0) == ACCEPTED
+        write_payload(receiver, data)
+        assert read(receiver, FRAMES_AT, 8, 0) == REPEATED
         broken = bytes([*data[:3], data[3] ^ 1, *data[4:]])
-        write_payload(received, broken)
-        assert read(received, FRAMES_AT, 8, 0) == WRONG_CHECKSUM
+        write_payload(receiver, broken)
+        assert read(receiver, FRAMES_AT, 8, 0) == WRONG_CHECKSUM
 
 
-def test_pages_of_a_message_have_one_alive_counter(compiled: tuple) -> None:
+def test_pages_of_a_message_have_one_alive_counter(functions: tuple) -> None:
     """Of a multiplexed message the sender counts all frames, and the receiver takes the next one of any page."""
     pages = [FrameSpec(name=f"page {page}", identifier=5, length=2, sender=Role.RIG, fields=(
         Field(name="selector", lowest=0, length=4, fixed=page),
         Field(name="count", lowest=8, length=4, guard=Guard.COUNTER))) for page in (0, 1)]
-    sent, received = make_layout(pages, [], Role.RIG), make_layout(pages, [], Role.CONTROLLER)
+    sender, receiver = make_layout(pages, [], Role.RIG), make_layout(pages, [], Role.CONTROLLER)
     for number in range(40):
-        compiled[0](sent, list_frame_places(sent)[number % 2], 0)
-        data = read_payload(sent, pages[0])
+        functions[0](sender, list_frame_places(sender)[number % 2], 0)
+        data = read_payload(sender, pages[0])
         assert data == bytes((number % 2, number % 16))
-        write_payload(received, data)
-        at = compiled[2](received, 5)
-        assert compiled[1](received, at, 2, 0) == ACCEPTED and compiled[1](received, at, 2, 0) == REPEATED
+        write_payload(receiver, data)
+        at = functions[2](receiver, 5)
+        assert functions[1](receiver, at, 2, 0) == ACCEPTED and functions[1](receiver, at, 2, 0) == REPEATED
 
 
-def test_an_answer_names_its_cycle(compiled: tuple) -> None:
+def test_an_answer_names_its_cycle(functions: tuple) -> None:
     """A frame with a cycle counter is taken in this cycle alone; the counter wraps."""
     spec = FrameSpec(name="drive", identifier=1, length=3, sender=Role.CONTROLLER, fields=(
         Field(name="current", lowest=0, length=16), Field(name="cycle", lowest=16, length=8)))
     layout = make_layout([spec], ["current"], Role.RIG)
     write_payload(layout, bytes((1, 0, 0x34)))
-    assert compiled[1](layout, FRAMES_AT, 3, 0x1234) == ACCEPTED
-    assert compiled[1](layout, FRAMES_AT, 3, 0x1235) == OTHER_CYCLE
+    assert functions[1](layout, FRAMES_AT, 3, 0x1234) == ACCEPTED
+    assert functions[1](layout, FRAMES_AT, 3, 0x1235) == OTHER_CYCLE

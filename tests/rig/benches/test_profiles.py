@@ -16,40 +16,40 @@ WORDS_402 = {state: next(value for mask, value, row in CIA402.states if row == s
 
 def test_the_states_of_cia_402_are_those_of_the_canopen_library() -> None:
     for word in range(1 << 16):
-        expected = [state for name, state in NAMES.items()
-                    if word & State402.SW_MASK[name][0] == State402.SW_MASK[name][1]]
-        assert find_state(CIA402, word) == (expected[0] if expected else State.UNKNOWN), hex(word)
+        states = [state for name, state in NAMES.items()
+                  if word & State402.SW_MASK[name][0] == State402.SW_MASK[name][1]]
+        assert find_state(CIA402, word) == (states[0] if states else State.UNKNOWN), hex(word)
 
 
 def test_the_control_words_of_cia_402_are_those_of_the_canopen_library() -> None:
-    named = State402.CW_COMMANDS_CODE
-    assert CIA402.ladder == tuple(named[name] for name in ("DISABLE VOLTAGE", "READY TO SWITCH ON", "SWITCHED ON",
+    codes = State402.CW_COMMANDS_CODE
+    assert CIA402.ladder == tuple(codes[name] for name in ("DISABLE VOLTAGE", "READY TO SWITCH ON", "SWITCHED ON",
                                                           "OPERATION ENABLED"))
-    assert CIA402.quick_stop == named["QUICK STOP ACTIVE"] and CIA402.reset == named["SWITCH ON DISABLED"]
-    for wanted, word in enumerate(CIA402.ladder):
-        assert find_wanted(CIA402, word) == wanted
+    assert CIA402.quick_stop == codes["QUICK STOP ACTIVE"] and CIA402.reset == codes["SWITCH ON DISABLED"]
+    for target, word in enumerate(CIA402.ladder):
+        assert find_wanted(CIA402, word) == target
     assert find_wanted(CIA402, CIA402.quick_stop) == State.QUICK_STOP
 
 
 def test_the_transitions_of_cia_402_are_those_of_the_canopen_library() -> None:
     assert {(before, after) for before, after, _ in TRANSITIONS.values()} == set(TABLE)
-    for before, after, wanted in TRANSITIONS.values():
-        if wanted is State.FAULT:
+    for before, after, target in TRANSITIONS.values():
+        if target is State.FAULT:
             assert TABLE[before, after] == CIA402.reset
-        elif wanted is not None:
-            assert find_wanted(CIA402, TABLE[before, after]) == wanted
+        elif target is not None:
+            assert find_wanted(CIA402, TABLE[before, after]) == target
 
 
 @pytest.mark.parametrize("start", NAMES.values())
-@pytest.mark.parametrize("wanted", [State.OFF, State.READY, State.ON, State.ACTIVE])
-def test_every_state_is_reached_from_every_other_one(start: State, wanted: State) -> None:
+@pytest.mark.parametrize("goal", [State.OFF, State.READY, State.ON, State.ACTIVE])
+def test_every_state_is_reached_from_every_other_one(start: State, goal: State) -> None:
     state, word = start, 0
     for _ in range(8):
-        word = choose_control(CIA402, wanted, find_state(CIA402, WORDS_402[state]), word, resets=True)
-        automatic = {(before, after) for before, after, asked in TRANSITIONS.values() if asked is None}
-        state = next((after for (before, after), needed in TABLE.items()
-                      if before == state and (needed == word or (before, after) in automatic)), state)
-    assert state == wanted
+        word = choose_control(CIA402, goal, find_state(CIA402, WORDS_402[state]), word, resets=True)
+        automatic = {(before, after) for before, after, target in TRANSITIONS.values() if target is None}
+        state = next((after for (before, after), control in TABLE.items()
+                      if before == state and (control == word or (before, after) in automatic)), state)
+    assert state == goal
 
 
 def test_quick_stop_is_asked_for_directly() -> None:
@@ -66,11 +66,11 @@ def test_a_fault_is_acknowledged_by_a_rising_edge_and_only_where_asked_for(words
 
 def test_the_words_of_cia_408_are_those_of_the_bus_page() -> None:
     assert [find_state(CIA408, 8 | word) for word in CIA408.ladder] == [*State][:4]
-    status, sent = 0, []
+    status, words = 0, []
     for _ in range(6):  # the device confirms each word, and wakes up in fault
-        sent.append(choose_control(CIA408, State.ACTIVE, find_state(CIA408, status), resets=True))
-        status = 8 | sent[-1] & 7
-    assert sent == [8, 1, 3, 7, 7, 7]
+        words.append(choose_control(CIA408, State.ACTIVE, find_state(CIA408, status), resets=True))
+        status = 8 | words[-1] & 7
+    assert words == [8, 1, 3, 7, 7, 7]
 
 
 def test_a_device_without_a_control_word_is_active_where_the_rig_enables_it() -> None:
