@@ -102,15 +102,15 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_rows_as_one_process(
         cluster: tuple[str, list[subprocess.Popen[bytes]]], environment: Path, gate: Path, local: Path,
         tmp_path: Path) -> None:
     address, processes = cluster
-    there = tmp_path / "there"
-    process = started("campaign", *MATRIX, "--out", there, "--scheduler", address, "--quiet")
+    folder = tmp_path / "there"
+    process = started("campaign", *MATRIX, "--out", folder, "--scheduler", address, "--quiet")
     wait_for(lambda: len({pid for pid, _ in calls(environment)}) == 2, process)
     victim, at_work = calls(environment)[-1]  # in the middle of a case, for the gate holds it up
     assert victim in [worker.pid for worker in processes[1:]]
     os.kill(victim, signal.SIGKILL)
     gate.unlink()
     assert finished(process).status == 1  # one case fails
-    assert rows(there) == rows(local) == rows(there / judge.RESULTS)
+    assert rows(folder) == rows(local) == rows(folder / judge.RESULTS)
     did = calls(environment)
     assert Counter(source for _, source in did)[at_work] == 2 and len({pid for pid, _ in did}) >= 2
 
@@ -118,19 +118,19 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_rows_as_one_process(
 def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
         environment: Path, gate: Path, local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAMPAIGN_FREE", "3")
-    there, few = tmp_path / "there", ("--most", 6, "--jobs", 1)
-    process = started("campaign", *MATRIX, *few, "--out", there)
-    wait_for(lambda: len(calls(environment)) == 4 and (there / judge.ROWS).read_bytes().count(b"\n") == 3, process)
+    folder, few = tmp_path / "there", ("--most", 6, "--jobs", 1)
+    process = started("campaign", *MATRIX, *few, "--out", folder)
+    wait_for(lambda: len(calls(environment)) == 4 and (folder / judge.ROWS).read_bytes().count(b"\n") == 3, process)
     process.kill()
     process.wait()
     gate.unlink()
-    done = rows(there)
+    done = rows(folder)
     assert len(done) == 3
-    with (there / judge.ROWS).open("a") as out:
+    with (folder / judge.ROWS).open("a") as out:
         out.write('{"case": 5, "label": "hea')  # as a kill in the middle of a write leaves it
-    result = rig("campaign", there, *few, *MATRIX[-2:], "--json")
+    result = rig("campaign", folder, *few, *MATRIX[-2:], "--json")
     assert (result.status, result.json["cases"]) == (0, 6)
-    assert rows(there) == rows(local)[:6] and rows(there / judge.RESULTS) == rows(there)
+    assert rows(folder) == rows(local)[:6] and rows(folder / judge.RESULTS) == rows(folder)
     again = Counter(source for _, source in calls(environment))
     assert len(again) == 6 and sum(again.values()) <= 7  # the one that the kill interrupted may have begun twice
     for row in done:
@@ -138,15 +138,15 @@ def test_a_campaign_that_was_killed_goes_on_and_repeats_nothing(
 
 
 def test_a_failed_case_is_kept_with_its_reason_and_judged_again_on_demand(local: Path, tmp_path: Path) -> None:
-    failed = [row for row in rows(local) if row["status"] == "failed"]
-    assert [(row["label"], row["seed"], row["reason"]) for row in failed] == [
+    failures = [row for row in rows(local) if row["status"] == "failed"]
+    assert [(row["label"], row["seed"], row["reason"]) for row in failures] == [
         ("filter_clogging=0.9", 1, "ZeroDivisionError: nothing left to divide")]
-    assert "rms" not in failed[0] and "rms" in rows(local)[0]
-    copy, seen = shutil.copytree(local, tmp_path / "copy"), list[BatchProgress]()
-    whole = judge.read_matrix_of_folder(copy)
-    assert len(run_campaign(whole, copy, Workers(), seen.append)) == 8 and seen == []
-    again = run_campaign(whole, copy, Workers(), seen.append, redo_failed=True)
-    assert [p.row["label"] for p in seen] == ["filter_clogging=0.9"] and seen[0].done == 8
+    assert "rms" not in failures[0] and "rms" in rows(local)[0]
+    copy, progress = shutil.copytree(local, tmp_path / "copy"), list[BatchProgress]()
+    matrix = judge.read_matrix_of_folder(copy)
+    assert len(run_campaign(matrix, copy, Workers(), progress.append)) == 8 and progress == []
+    again = run_campaign(matrix, copy, Workers(), progress.append, redo_failed=True)
+    assert [p.row["label"] for p in progress] == ["filter_clogging=0.9"] and progress[0].done == 8
     assert [row["case"] for row in again] == list(range(8)) and rows(copy) == rows(local)
 
 
@@ -180,13 +180,13 @@ def test_a_matrix_file_says_the_same_as_options_and_any_beginning_is_a_fair_samp
         filter_clogging = [0.1, 0.2]
         spool_friction = 45.0
         tolerance = [0.0, 0.02]''')
-    found = judge.build_matrix(judge.read_matrix(str(tmp_path / "m.toml")), Model(), "fdi", "m")
-    whole, half = (Counter(c.label for c in some) for some in (found.cases, found.cases[:8]))
+    matrix = judge.build_matrix(judge.read_matrix(str(tmp_path / "m.toml")), Model(), "fdi", "m")
+    whole, half = (Counter(c.label for c in some) for some in (matrix.cases, matrix.cases[:8]))
     assert whole == {"healthy": 8, "filter_clogging=0.1 spool_friction=45": 4,
                      "filter_clogging=0.2 spool_friction=45": 4} == {label: 2 * count for label, count in half.items()}
-    assert [c.number for c in found.cases] == list(range(16)) and len(set(map(str, found.cases))) == 16
-    assert {c.tolerance for c in found.cases if c.sizes} == {0.0, 0.02}
-    assert judge.restore_matrix(json.loads(json.dumps(found.spec))).cases == found.cases
+    assert [c.number for c in matrix.cases] == list(range(16)) and len(set(map(str, matrix.cases))) == 16
+    assert {c.tolerance for c in matrix.cases if c.sizes} == {0.0, 0.02}
+    assert judge.restore_matrix(json.loads(json.dumps(matrix.spec))).cases == matrix.cases
     shipped = judge.build_matrix(judge.read_matrix("statistics"), Model(), "fdi", "statistics")
     labels = Counter(c.label for c in shipped.cases)
     assert len(shipped.cases) >= 500 and labels["healthy"] >= 200 and labels[campaign_summary.OFF_GRID] >= 200
@@ -199,9 +199,9 @@ def test_a_case_depends_on_its_own_seed_alone_and_hides_what_it_says() -> None:
     other = judge.simulate_case(case._replace(seed=4), spec, Model())
     for name in ("xj", "cor", "p12", "xs"):
         assert (first.column(name) == second.column(name)).all() and (first.column(name) != other.column(name)).any()
-    broken = judge.add_faults(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
-    assert broken["spool.dynamic_friction"] == pytest.approx(30.0) and broken["jack.dynamic_friction"] == 1000.0
-    assert broken[CATALOGUE["stribeck"].fitted[0]] == 0.3 and broken[CATALOGUE["stribeck"].fitted[1]] > 0
+    model = judge.add_faults(Model(), {"spool_friction": 45.0, "jack_friction": 1600.0, "stribeck": 0.3})
+    assert model["spool.dynamic_friction"] == pytest.approx(30.0) and model["jack.dynamic_friction"] == 1000.0
+    assert model[CATALOGUE["stribeck"].fitted[0]] == 0.3 and model[CATALOGUE["stribeck"].fitted[1]] > 0
     assert set(judge.simulate_case(case, {**spec, "signals": "xj"}, Model()).signals) == {"com", "xj", "cor", "load"}
 
 
@@ -211,11 +211,11 @@ def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tm
         Trace.from_columns(columns, 1e-3, {}).write_csv(tmp_path / name)
     (tmp_path / "c.csv").write_text("nothing\n1\n")
     words = ("campaign", tmp_path, "--out", tmp_path / "out", *MATRIX[-2:], "--json", "--jobs", 1)
-    result, found = rig(*words), rows(tmp_path / "out")
+    result, case_rows = rig(*words), rows(tmp_path / "out")
     assert (result.status, result.json["status"]) == (0, {"ok": 2, "refused": 1})
     assert ("FSS [N]" in rig("campaign", tmp_path / "out", "--summary").out
-            and [row["label"] for row in found] == ["a.csv.gz", "b.csv", "c.csv"])
-    assert found[2]["reason"].startswith(str(tmp_path / "c.csv"))
+            and [row["label"] for row in case_rows] == ["a.csv.gz", "b.csv", "c.csv"])
+    assert case_rows[2]["reason"].startswith(str(tmp_path / "c.csv"))
     Trace.from_columns(columns, 2e-3, {}).write_csv(tmp_path / "b.csv")
     assert "it differs in files" in refuse(*words)
 
@@ -228,8 +228,8 @@ def test_rig_fdi_in_a_campaign_finds_both_faults_and_the_statistics_are_written(
     assert row["kintas"] == pytest.approx(0.17, rel=0.1) and row["fss"] == pytest.approx(45.0, rel=0.05)
     assert row["kintas_low"] < 0.17 < row["kintas_high"] and row["fss_low"] < 45.0 < row["fss_high"]
     assert (row["level_spool_friction"], row["ruling"]) == ("maintenance", "spool_friction")
-    shown = rig("campaign", tmp_path / judge.RESULTS, "--summary").out
-    assert "off-grid FSS within 2 %" in shown and "1/1" in shown
+    summary = rig("campaign", tmp_path / judge.RESULTS, "--summary").out
+    assert "off-grid FSS within 2 %" in summary and "1/1" in summary
     assert answer("campaign", tmp_path, "--summary") == result.json
     assert json.loads((tmp_path / "summary.json").read_text()) == result.json
 
@@ -239,10 +239,10 @@ def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(
     work = ("--work", "campaign_work:count_rows")
     rig("campaign", "--model", "my_motor.py", "--fault", "healthy", "--seeds", 3, "--out", "two", "--jobs", 2,
         "--most", 2, *work)
-    found = rows(here / "two")
+    case_rows = rows(here / "two")
     fault, = judge.restore_faults(judge.read_matrix_of_folder("two").spec)
-    assert [row["status"] for row in found] == ["ok", "ok"]
-    truth = {row[f"true_{fault.key}"] for row in found}
+    assert [row["status"] for row in case_rows] == ["ok", "ok"]
+    truth = {row[f"true_{fault.key}"] for row in case_rows}
     assert len(truth) == 2 and fault.healthy not in truth  # the parameter of the fault scatters as well
     assert "expected --trust" in refuse("campaign", "two", *work)
     with Path("my_motor.py").open("a") as file:
@@ -254,37 +254,37 @@ def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(
 CLOGGING, FRICTION = "filter_clogging", "spool_friction"
 
 
-def judged(label: str, kintas: float, fss: float, reported: tuple[str, str], n: int, **more: Any
+def judged(label: str, kintas: float, fss: float, level_pair: tuple[str, str], n: int, **more: Any
            ) -> list[dict[str, Any]]:
     sizes = {"kintas": kintas, "kintas_low": kintas - 0.02, "kintas_high": kintas + 0.02, "fss": fss * 1.01,
              "fss_low": np.float64(fss * 0.95), "fss_high": fss * 1.005}
-    levels = dict(zip(("filter_clogging", "spool_friction"), reported, strict=True))
+    levels = dict(zip(("filter_clogging", "spool_friction"), level_pair, strict=True))
     ruling = next((fault for fault, level in levels.items() if level != "acceptable"), "")
     return [{"label": label, "faults": len(label.split()) if label != "healthy" else 0, "tolerance": 0.015, "seed": i,
-             "status": "ok", "reason": "", "true_kintas": kintas, "true_fss": fss, "level_filter_clogging": reported[0],
-             "level_spool_friction": reported[1], "ruling": ruling,
-             "band_spool_friction": reported[1] if reported[1] == "non_nominal" else "acceptable",
+             "status": "ok", "reason": "", "true_kintas": kintas, "true_fss": fss,
+             "level_filter_clogging": level_pair[0], "level_spool_friction": level_pair[1], "ruling": ruling,
+             "band_spool_friction": level_pair[1] if level_pair[1] == "non_nominal" else "acceptable",
              "seconds": 2.0, **sizes, **more} for i in range(n)]
 
 
 def test_statistics_count_what_was_said() -> None:
     fine, bad, worst = "acceptable", "maintenance", "non_nominal"
-    found = [*judged("healthy", 0.0, 5.0, (fine, fine), 399), *judged("healthy", 0.0, 5.0, (fine, bad), 3),
-             *judged("filter_clogging=0.25", 0.25, 5.0, (bad, fine), 38),
-             *judged("filter_clogging=0.25", 0.25, 5.0, (fine, fine), 2),
-             *judged("spool_friction=70", 0.0, 70.0, (fine, worst), 30),
-             *judged("spool_friction=70", 0.0, 70.0, (bad, fine), 1),
-             *judged("spool_friction=70", 0.0, 70.0, (fine, fine), 1, status="refused"),
-             *judged(campaign_summary.OFF_GRID, 0.17, 45.0, (fine, bad), 25)]
-    figures = campaign_summary.summarise_campaign(found)
+    case_rows = [*judged("healthy", 0.0, 5.0, (fine, fine), 399), *judged("healthy", 0.0, 5.0, (fine, bad), 3),
+                 *judged("filter_clogging=0.25", 0.25, 5.0, (bad, fine), 38),
+                 *judged("filter_clogging=0.25", 0.25, 5.0, (fine, fine), 2),
+                 *judged("spool_friction=70", 0.0, 70.0, (fine, worst), 30),
+                 *judged("spool_friction=70", 0.0, 70.0, (bad, fine), 1),
+                 *judged("spool_friction=70", 0.0, 70.0, (fine, fine), 1, status="refused"),
+                 *judged(campaign_summary.OFF_GRID, 0.17, 45.0, (fine, bad), 25)]
+    figures = campaign_summary.summarise_campaign(case_rows)
     (part,) = figures["tolerances"]
     rates = {rate["name"]: (rate["share"]["good"], rate["share"]["of"], rate["met"]) for rate in part["rates"]}
-    expected = {
+    expected_rates = {
         "healthy: false alarm": (3, 402, False), "Kintas at MidBand detected": (38, 40, True),
         "FSS at MaxBand detected": (30, 32, False), "Kintas at MaxBand detected": (0, 0, None),
         "ruling fault, MidBand on": (68, 72, False), "off-grid Kintas covered": (25, 25, False),
         "off-grid FSS within 2 %": (25, 25, None)}
-    assert {name: rates[name] for name in expected} == expected
+    assert {name: rates[name] for name in expected_rates} == expected_rates
     points = [(p["size"], *(p[key]["good"] for key in ("detected", "most", "bands"))) for p in part["curves"][FRICTION]]
     assert points == [(5.0, 3, 0, 0), (70.0, 30, 30, 30)]
     assert part["levels"][CLOGGING]["acceptable"] == {
@@ -294,18 +294,18 @@ def test_statistics_count_what_was_said() -> None:
     error = next(e for e in part["errors"] if (e["label"], e["fault"]) == (campaign_summary.OFF_GRID, FRICTION))
     assert (error["bias"], error["rms"], error["covered"]["good"]) == (pytest.approx(0.45), pytest.approx(0.45), 25)
     json.dumps(figures, allow_nan=False)
-    text, drawn = format_report(build_campaign_report(figures), 100), campaign_summary.draw_detection_curves(part)
+    text, svg = format_report(build_campaign_report(figures), 100), campaign_summary.draw_detection_curves(part)
     assert "3/402" in text and "NOT met" in text and "93.8 (79.2 .. 99.2)" in text
-    assert drawn.startswith("<svg") and "MaxBand" in drawn and "maintenance or worse" in drawn
+    assert svg.startswith("<svg") and "MaxBand" in svg and "maintenance or worse" in svg
 
 
-@pytest.mark.parametrize(("good", "of", "least", "most", "met"), [
+@pytest.mark.parametrize(("good", "of", "least", "most", "is_met"), [
     (0, 23, 0.0, 0.005, None), (0, 200, 0.0, 0.005, True), (2, 200, 0.0, 0.005, False), (10, 100, 0.0, 0.005, False),
     (19, 20, 0.95, 1.0, True), (5, 5, 0.95, 1.0, None), (30, 32, 0.995, 1.0, False), (95, 100, 0.93, 0.97, True),
     (99, 100, 0.93, 0.97, False), (3, 9, 0.0, 1.0, None), (0, 0, 0.95, 1.0, None)])
-def test_a_rate_is_judged_when_enough_was_counted(good: int, of: int, least: float, most: float, met: bool | None
+def test_a_rate_is_judged_when_enough_was_counted(good: int, of: int, least: float, most: float, is_met: bool | None
                                                   ) -> None:
-    assert campaign_summary.judge_rate("", measure_share(good, of), least, most)["met"] is met
+    assert campaign_summary.judge_rate("", measure_share(good, of), least, most)["met"] is is_met
 
 
 def fail_test(job: object, reason: str) -> Any:
