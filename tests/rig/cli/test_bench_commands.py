@@ -72,8 +72,8 @@ def test_the_guess_of_an_example_is_the_example(name: str, option: str, words: t
     """For the frames; what the data sheet cannot say is marked."""
     path, sheet = tmp_path / f"{name}.toml", SHEETS[name]
     assert rig("new", "bench", name, option, sheet, *words, "--out", path).status == 0
-    guessed, own = load_bench(str(path)), load_bench(str(sheet.parent / "bench.toml"))
-    assert (repr(guessed.frames), guessed.phases, guessed.ready) == (repr(own.frames), own.phases, own.ready)
+    guess, bench = load_bench(str(path)), load_bench(str(sheet.parent / "bench.toml"))
+    assert (repr(guess.frames), guess.phases, guess.ready) == (repr(bench.frames), bench.phases, bench.ready)
 
 
 TRIM_DBC = """VERSION ""
@@ -92,9 +92,9 @@ def test_a_bench_of_an_own_plant_is_guessed_from_its_signals(tmp_path: Path) -> 
     """A plant may declare units of its own, such as deg, and the device others of the same quantity."""
     (tmp_path / "trim.dbc").write_text(TRIM_DBC)
     (tmp_path / "jack.py").write_text(PLANT.read_text().replace('"tc", "rad"', '"tc", "deg"'))
-    made = rig("new", "bench", "trim", "--dbc", tmp_path / "trim.dbc", "--model", tmp_path / "jack.py",
-               "--out", tmp_path / "trim.toml")
-    assert made.status == 0 and "COMPLETE" in made.out
+    result = rig("new", "bench", "trim", "--dbc", tmp_path / "trim.dbc", "--model", tmp_path / "jack.py",
+                 "--out", tmp_path / "trim.toml")
+    assert result.status == 0 and "COMPLETE" in result.out
     bench = load_bench(str(tmp_path / "trim.toml"))
     counts = {each.name: each.count for spec in bench.frames.frames for each in spec.fields}
     assert {name: float(count) for name, count in counts.items()} == pytest.approx({
@@ -163,11 +163,11 @@ def test_the_doctor_listens_for_a_bench() -> None:
         finally:
             stop.set()
             sender.result()  # raises what went wrong in it
-    found = {each["name"].split()[0]: each for each in result.json["findings"]}
-    assert found["Drive"]["status"] == "limited"
-    assert f"some of 2 bytes, not {drive.length}" in found["Drive"]["found"]
-    assert "another rig" in found["Demand"]["remedy"] and found["Feedback"]["found"] == "none; the rig sends it"
-    assert found["other"]["found"].startswith("0x123 (")
+    findings = {each["name"].split()[0]: each for each in result.json["findings"]}
+    assert findings["Drive"]["status"] == "limited"
+    assert f"some of 2 bytes, not {drive.length}" in findings["Drive"]["found"]
+    assert "another rig" in findings["Demand"]["remedy"] and findings["Feedback"]["found"] == "none; the rig sends it"
+    assert findings["other"]["found"].startswith("0x123 (")
 
 
 def test_every_key_signal_and_checksum_is_on_the_page() -> None:

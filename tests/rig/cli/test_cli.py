@@ -89,8 +89,8 @@ def test_timing_that_is_invalid(short: Path, tmp_path: Path, monkeypatch: pytest
     """A bench that was late itself says so, exit status 3, whatever the checks say."""
     tick, calls = Master.tick, iter(range(10**6))
     monkeypatch.setattr(Master, "tick", lambda self: (time.sleep(0.004 * (next(calls) % 20 == 0)), tick(self)))
-    told = answer("run", short, "--pace", "realtime", "--out", tmp_path / "out", status=3)
-    assert told["verdict"] == "INVALID_TIMING" and told["timing"]["overruns"] > 10
+    outcome = answer("run", short, "--pace", "realtime", "--out", tmp_path / "out", status=3)
+    assert outcome["verdict"] == "INVALID_TIMING" and outcome["timing"]["overruns"] > 10
 
 
 @pytest.mark.parametrize("bug", [ZeroDivisionError, BlockingIOError])  # the latter is no other run in the folder
@@ -199,9 +199,9 @@ def test_the_parameters_are_those_that_set_takes() -> None:
     for name, row in rows.items():
         if isinstance(row["default"], float):
             load_model().replace({name: row["default"]})  # a default is a value that --set takes
-    own = {row["name"]: row["default"] for row in
-           rig("list", "parameters", "jack", "--set", "jack.mass=150", "--json").json["parameters"]}
-    assert all("jack" in name for name in own) and own["jack.mass"] == 150.0
+    defaults = {row["name"]: row["default"] for row in
+                rig("list", "parameters", "jack", "--set", "jack.mass=150", "--json").json["parameters"]}
+    assert all("jack" in name for name in defaults) and defaults["jack.mass"] == 150.0
 
 
 def test_sequences_checks_and_models_can_be_used() -> None:
@@ -217,19 +217,19 @@ def test_a_name_that_a_list_lacks() -> None:
 
 
 def test_the_first_steps_are_commands_that_exist() -> None:
-    named = re.findall(r"^    rig (\w+)", FIRST_STEPS, re.MULTILINE)
-    alone = rig()
-    assert (alone.status, alone.out, alone.err.count("\n")) == (2, FIRST_STEPS + "\n", 1)
-    assert len(named) >= 5 and set(named) <= set(COMMANDS)
+    commands = re.findall(r"^    rig (\w+)", FIRST_STEPS, re.MULTILINE)
+    result = rig()
+    assert (result.status, result.out, result.err.count("\n")) == (2, FIRST_STEPS + "\n", 1)
+    assert len(commands) >= 5 and set(commands) <= set(COMMANDS)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("argcomplete") is None, reason="no argcomplete (extra shell)")
-@pytest.mark.parametrize(("line", "expected"), [
+@pytest.mark.parametrize(("line", "completions"), [
     ("rig con", {"conformance"}), ("rig run --set filter.c", {"filter.clogging="}),
     ("rig compare --rep", {"--repeat", "--report"}), ("rig effects null_b", {"null_bias"}),
     ("rig run --model ", {"eha", "ehs", "ema", "servo", "emps", "own.py", "own.toml", "ownfolder/"}),
     ("rig check pre", {"preflight", "preflight_ema"}), ("rig check own", {"own.toml", "ownfolder/"})])
-def test_the_answer_to_the_shell(line: str, expected: set[str], tmp_path: Path) -> None:
+def test_the_answer_to_the_shell(line: str, completions: set[str], tmp_path: Path) -> None:
     (tmp_path / "ownfolder").mkdir()
     for name in ("own.toml", "own.py", "own.txt"):
         (tmp_path / name).touch()
@@ -239,7 +239,7 @@ def test_the_answer_to_the_shell(line: str, expected: set[str], tmp_path: Path) 
                    "_ARGCOMPLETE_IFS": "\n", "PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-m", "rig.cli.main"], env=environment, cwd=tmp_path, check=False,
                    capture_output=True, timeout=60)
-    assert {word.strip() for word in answer.read_text().split("\n")} == expected
+    assert {word.strip() for word in answer.read_text().split("\n")} == completions
 
 
 @pytest.fixture(scope="module")
@@ -267,12 +267,12 @@ def test_a_missing_package_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_tools_that_are_not_there_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_SEARCH_PATH", "/nowhere")
-    found = {finding.name: finding for finding in [*doctor.examine_tools(), *doctor.examine_buses()]}
-    assert found["C compiler"].status == "missing" and "gcc" in found["C compiler"].remedy
-    assert found["CAN guest"].remedy == "apt-get install user-mode-linux kmod iproute2"
+    findings = {finding.name: finding for finding in [*doctor.examine_tools(), *doctor.examine_buses()]}
+    assert findings["C compiler"].status == "missing" and "gcc" in findings["C compiler"].remedy
+    assert findings["CAN guest"].remedy == "apt-get install user-mode-linux kmod iproute2"
 
 
 def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
-    told = answer("doctor", "--out", tmp_path / "doctor.json")
-    assert told == json.loads((tmp_path / "doctor.json").read_text()) and told["verdict"] == "PASS"
+    report = answer("doctor", "--out", tmp_path / "doctor.json")
+    assert report == json.loads((tmp_path / "doctor.json").read_text()) and report["verdict"] == "PASS"
     assert rig("doctor", "--quiet") == CommandResult(0, "", "", ())

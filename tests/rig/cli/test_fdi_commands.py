@@ -42,17 +42,18 @@ def fault(folder: Path) -> CommandResult:
 
 
 def test_json_of_a_model_that_fits(folder: Path) -> None:
-    told = answer("compare", folder / "est.csv", "--repeat", folder / "repeat.csv")
-    assert (told["verdict"], told["repeats"]) == ("WITHIN_FLOOR", 1)
-    assert {name: signal["unit"] for name, signal in told["signals"].items()} == {"xj": "m", "p12": "Pa", "xs": "m"}
+    comparison = answer("compare", folder / "est.csv", "--repeat", folder / "repeat.csv")
+    assert (comparison["verdict"], comparison["repeats"]) == ("WITHIN_FLOOR", 1)
+    assert {name: signal["unit"] for name, signal in comparison["signals"].items()} == {
+        "xj": "m", "p12": "Pa", "xs": "m"}
     for name, floor in (("xj", 2e-6), ("p12", 2e4), ("xs", 1e-6)):
-        signal = told["signals"][name]
+        signal = comparison["signals"][name]
         assert (signal["error"], signal["floor"]) == pytest.approx((floor, floor), rel=0.05)
         assert signal["ratio"] == pytest.approx(signal["error"] / signal["floor"]) and signal["closed_loop_error"] > 0
-    assert 0 < told["solver_error"] < 0.1 * told["signals"]["xj"]["floor"]
-    assert set(told["blocks"]) == {"controller", "servovalve", "jack", "sensor"}
-    assert all({"section", "t0", "t1", "share", "condition"} <= set(place) for place in told["where"])
-    assert sum(place["share"] for place in told["where"]) == pytest.approx(1.0, abs=0.01)
+    assert 0 < comparison["solver_error"] < 0.1 * comparison["signals"]["xj"]["floor"]
+    assert set(comparison["blocks"]) == {"controller", "servovalve", "jack", "sensor"}
+    assert all({"section", "t0", "t1", "share", "condition"} <= set(place) for place in comparison["where"])
+    assert sum(place["share"] for place in comparison["where"]) == pytest.approx(1.0, abs=0.01)
 
 
 def test_words_of_a_model_that_does_not(fault: CommandResult, folder: Path) -> None:
@@ -95,8 +96,8 @@ def test_results_go_where_they_should(folder: Path) -> None:
 
 def test_a_run_of_the_bench(preflight: Path) -> None:
     """The log of a whole run over the bus, quantised as its frames are."""
-    told = answer("compare", preflight)
-    assert told["verdict"] == "WITHIN_FLOOR" and told["blocks"]["controller"] < 1.2
+    comparison = answer("compare", preflight)
+    assert comparison["verdict"] == "WITHIN_FLOOR" and comparison["blocks"]["controller"] < 1.2
 
 
 def test_few_rows_still_have_a_page(tmp_path: Path) -> None:
@@ -129,38 +130,38 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def found(runs: dict[str, Path]) -> CommandResult:
+def explanation(runs: dict[str, Path]) -> CommandResult:
     """One search; its page is page.html beside the run."""
     return rig("explain", *list_trace_arguments(runs), "--json", "--out", runs["est"].with_name("page.html"))
 
 
-def test_the_effect_is_named_with_its_evidence(found: CommandResult) -> None:
-    answer, hidden = found.json, HIDDEN["null_bias.current"]
+def test_the_effect_is_named_with_its_evidence(explanation: CommandResult) -> None:
+    answer, truth = explanation.json, HIDDEN["null_bias.current"]
     best, *others = answer["candidates"]
-    assert (found.status, answer["verdict"], answer["effects"]) == (1, "EXPLAINED", ["null_bias"])
+    assert (explanation.status, answer["verdict"], answer["effects"]) == (1, "EXPLAINED", ["null_bias"])
     assert (best["effect"], best["word"]) == ("null_bias", "explains")
     assert best["ratio"] < 1.1 and best["evidence"] > 1000.0 and best["p_value"] < 1e-6
     current = best["parameters"]["null_bias.current"]
-    assert current["unit"] == "A" and current["low"] < hidden < current["high"] < current["low"] + 0.1 * hidden
+    assert current["unit"] == "A" and current["low"] < truth < current["high"] < current["low"] + 0.1 * truth
     assert all(other["ratio"] > best["ratio"] for other in others) and answer["blind_to"] and answer["notes"] == []
 
 
-def test_baseline_and_floor(found: CommandResult) -> None:
-    base, best = found.json["baseline"], found.json["candidates"][0]
-    for told in (base, best):
-        assert set(told["error"]) == set(told["holdout"]) == set(base["floor"]) == SIGNALS
+def test_baseline_and_floor(explanation: CommandResult) -> None:
+    base, best = explanation.json["baseline"], explanation.json["candidates"][0]
+    for fit in (base, best):
+        assert set(fit["error"]) == set(fit["holdout"]) == set(base["floor"]) == SIGNALS
     assert base["floor"]["xj"] == pytest.approx(2e-6, rel=0.1) and base["error"]["xj"] > 10.0 * base["floor"]["xj"]
     assert all(best["error"][signal] < 1.1 * floor and best["holdout"][signal] < 1.15 * floor
                for signal, floor in base["floor"].items())
 
 
-def test_effects_that_hide_in_the_tolerances_are_listed_with_what_would_reveal_them(found: CommandResult) -> None:
-    blind = {b["effect"]: b for b in found.json["blind_to"]}
+def test_effects_that_hide_in_the_tolerances_are_listed_with_what_would_reveal_them(explanation: CommandResult) -> None:
+    blind = {b["effect"]: b for b in explanation.json["blind_to"]}
     offset = blind["sensor_offset"]  # no size of it shows in a closed loop
     assert (offset["smallest_visible"], offset["usual"], offset["unit"]) == (None, 2e-4, "m")
     assert "end stop" in offset["revealed_by"]
     assert "null_bias" not in blind and "constant_load" not in blind
-    assert "command_rate_limit" in found.json["seen_without_noise"]
+    assert "command_rate_limit" in explanation.json["seen_without_noise"]
 
 
 @pytest.mark.slow
@@ -172,20 +173,20 @@ def test_both_effects_of_the_readme_are_named(here: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def added(runs: dict[str, Path]) -> tuple[CommandResult, Path]:
+def addition(runs: dict[str, Path]) -> tuple[CommandResult, Path]:
     """The right effect in a new model file; not to be written to."""
     model = runs["est"].with_name("biased.toml")
     return rig("add", "null_bias", *list_trace_arguments(runs), "--json", "--out", model), model
 
 
 @pytest.fixture
-def model(added: tuple[CommandResult, Path], tmp_path: Path) -> Path:
+def model(addition: tuple[CommandResult, Path], tmp_path: Path) -> Path:
     """A copy of that file."""
-    return Path(shutil.copy(added[1], tmp_path / "biased.toml"))
+    return Path(shutil.copy(addition[1], tmp_path / "biased.toml"))
 
 
-def test_the_error_falls_to_the_floor(added: tuple[CommandResult, Path]) -> None:
-    result, path = added
+def test_the_error_falls_to_the_floor(addition: tuple[CommandResult, Path]) -> None:
+    result, path = addition
     floor, (before, after) = result.json["floor"], result.json["ledger"]
     assert (result.status, result.json["model"], result.json["helps"]) == (0, str(path), True)
     assert (before["effect"], after["effect"]) == (None, "null_bias")
@@ -195,18 +196,18 @@ def test_the_error_falls_to_the_floor(added: tuple[CommandResult, Path]) -> None
                for signal, level in floor.items())
 
 
-def test_the_file_is_a_model_with_intervals_and_provenance(added: tuple[CommandResult, Path], runs: dict[str, Path]
+def test_the_file_is_a_model_with_intervals_and_provenance(addition: tuple[CommandResult, Path], runs: dict[str, Path]
                                                            ) -> None:
-    result, path = added
-    model, known = update_model.load_model_file(path)
+    result, path = addition
+    model, provenance = update_model.load_model_file(path)
     assert model.effects == ("null_bias",) and load_model(path) == model
     value = result.json["parameters"]["null_bias.current"]
     assert model["null_bias.current"] == pytest.approx(value["value"], rel=1e-5)
     assert value["low"] < HIDDEN["null_bias.current"] < value["high"]
     assert re.search(r"^current = .*# A, .*\(95 %\)$", path.read_text(), re.MULTILINE)
-    assert known.effects == ("null_bias",) and known.trace and known.trace.file == str(runs["est"])
-    assert known.software.startswith("eha-rig") and [r.effect for r in known.ledger] == [None, "null_bias"]
-    before = update_model.remove_all_effects(model, known)
+    assert provenance.effects == ("null_bias",) and provenance.trace and provenance.trace.file == str(runs["est"])
+    assert provenance.software.startswith("eha-rig") and [r.effect for r in provenance.ledger] == [None, "null_bias"]
+    before = update_model.remove_all_effects(model, provenance)
     assert before.effects == () and before.values == Model().values
 
 
@@ -229,17 +230,17 @@ def test_such_a_model_simulates_and_lacks_nothing(model: Path, runs: dict[str, P
     assert json.loads((tmp_path / "found.json").read_text())["verdict"] == "NOTHING_MISSING"
 
 
-def test_the_ledger_goes_on_and_a_useless_effect_is_said_so(model: Path, added: tuple[CommandResult, Path]) -> None:
-    told = answer("add", "spool_overlap", "--model", model, status=1)  # the runs are those of the file
-    assert not told["helps"] and [row["effect"] for row in told["ledger"]] == [None, "null_bias", "spool_overlap"]
-    assert told["ledger"][0]["error"]["xj"] == pytest.approx(added[0].json["ledger"][0]["error"]["xj"], rel=1e-5)
+def test_the_ledger_goes_on_and_a_useless_effect_is_said_so(model: Path, addition: tuple[CommandResult, Path]) -> None:
+    report = answer("add", "spool_overlap", "--model", model, status=1)  # the runs are those of the file
+    assert not report["helps"] and [row["effect"] for row in report["ledger"]] == [None, "null_bias", "spool_overlap"]
+    assert report["ledger"][0]["error"]["xj"] == pytest.approx(addition[0].json["ledger"][0]["error"]["xj"], rel=1e-5)
     assert set(load_model(model).effects) == {"null_bias", "spool_overlap"}
-    assert model.with_name("biased.toml.bak").read_text() == added[1].read_text()
+    assert model.with_name("biased.toml.bak").read_text() == addition[1].read_text()
 
 
 def test_without_it_the_error_rises_again(model: Path, runs: dict[str, Path]) -> None:
-    told = answer("remove", "null_bias", *list_trace_arguments(runs), "--model", model)
-    before, after = told["ledger"][-2:]
+    removal = answer("remove", "null_bias", *list_trace_arguments(runs), "--model", model)
+    before, after = removal["ledger"][-2:]
     assert after["removed"] and after["effect"] == "null_bias"
     assert all(after[which]["xj"] > 10.0 * before[which]["xj"] for which in ("error", "holdout"))
     assert load_model(model).effects == () and update_model.read_provenance(model).effects == ()
@@ -259,24 +260,25 @@ def test_a_base_effect_comes_out_at_its_value_before(tmp_path: Path) -> None:
 
 
 def test_a_model_with_a_users_effect_finds_its_file_or_asks_for_it(tmp_path: Path) -> None:
-    own, run, file = write_file(tmp_path / "spring.py", SPRING), tmp_path / "s.csv", tmp_path / "m.toml"
+    effect_file, run, file = write_file(tmp_path / "spring.py", SPRING), tmp_path / "s.csv", tmp_path / "m.toml"
     with restored_catalogue():
-        assert rig("simulate", "--effects", own, "--set=spring.stiffness=1e5", "--out", run, "--quiet").status == 0
+        assert rig("simulate", "--effects", effect_file, "--set=spring.stiffness=1e5", "--out", run,
+                   "--quiet").status == 0
         model = Model().replace({"spring.stiffness": 1e5})
-        known = update_model.Provenance(effects=("spring",), effect_files=(str(own),))
+        provenance = update_model.Provenance(effects=("spring",), effect_files=(str(effect_file),))
         interval = {"spring.stiffness": Value(1e5, 9e4, 1.1e5, "N/m")}
-        file.write_text(update_model.format_model_file(model, interval, known))
-        assert update_model.load_model_file(file) == (model, known)
+        file.write_text(update_model.format_model_file(model, interval, provenance))
+        assert update_model.load_model_file(file) == (model, provenance)
         kind = load_plant(ROOT / "plant" / "models" / "new_plant.py")  # brings its own effects along
-        mine = write_file(tmp_path / "mine.toml", f'plant = "{kind.key}"\neffects = ["spring", "dry_friction"]\n'
-                          f'[provenance]\neffect_files = ["{own}"]\n')
-        assert update_model.load_model_file(mine)[0].effects == ("spring", "dry_friction")
+        plant_model = write_file(tmp_path / "mine.toml", f'plant = "{kind.key}"\neffects = ["spring", "dry_friction"]\n'
+                                 f'[provenance]\neffect_files = ["{effect_file}"]\n')
+        assert update_model.load_model_file(plant_model)[0].effects == ("spring", "dry_friction")
     with restored_catalogue():
         result = rig("compare", run, "--model", file, "--trust")
-    assert result.status == 0 and str(own) in result.err, result.err
-    own.rename(tmp_path / "elsewhere.py")
+    assert result.status == 0 and str(effect_file) in result.err, result.err
+    effect_file.rename(tmp_path / "elsewhere.py")
     for words in (["add", "null_bias", run], ["explain", run]):
-        assert f"--effects {own} with it, where spring is defined" in refuse(*words, "--model", file)
+        assert f"--effects {effect_file} with it, where spring is defined" in refuse(*words, "--model", file)
 
 
 CLOGGED = {"filter.clogging": 0.3}
@@ -289,35 +291,37 @@ def clogged(folder: Path) -> CommandResult:
 
 
 def test_json_of_a_healthy_unit(folder: Path) -> None:
-    told = answer("fdi", folder / "est.csv")
-    assert set(told) >= {"level", "ruling", "events", "precursors", "grid", "refined"}
-    assert set(told["grid"]["merged"]) >= {"kintas", "fss"} <= set(told["refined"])
-    assert told["level"] == {"filter_clogging": "acceptable", "spool_friction": "acceptable"}
-    assert (told["ruling"], told["verdict"], told["events"]) == (None, "ACCEPTABLE", [])
-    for size in (told["refined"]["kintas"], told["refined"]["fss"]):
+    diagnosis = answer("fdi", folder / "est.csv")
+    assert set(diagnosis) >= {"level", "ruling", "events", "precursors", "grid", "refined"}
+    assert set(diagnosis["grid"]["merged"]) >= {"kintas", "fss"} <= set(diagnosis["refined"])
+    assert diagnosis["level"] == {"filter_clogging": "acceptable", "spool_friction": "acceptable"}
+    assert (diagnosis["ruling"], diagnosis["verdict"], diagnosis["events"]) == (None, "ACCEPTABLE", [])
+    for size in (diagnosis["refined"]["kintas"], diagnosis["refined"]["fss"]):
         assert 0.0 <= size["low"] <= size["value"] <= size["high"]
-    assert told["refined"]["method"] == "least squares" and told["refined"]["simulations"] > 300
-    assert {"step", "ramp"} <= set(told["grid"]) and not any(other["unhealthy"] for other in told["others"].values())
+    assert diagnosis["refined"]["method"] == "least squares" and diagnosis["refined"]["simulations"] > 300
+    assert {"step", "ramp"} <= set(diagnosis["grid"]) and not any(
+        other["unhealthy"] for other in diagnosis["others"].values())
 
 
 def test_words_and_json_of_a_clogged_filter(clogged: CommandResult, folder: Path) -> None:
-    told = json.loads((folder / "clogged.json").read_text())
-    printed = re.match(r"MAINTENANCE  Filter clogging requires maintenance: Kintas ([\d.]+)\b", clogged.out)
-    kintas, text = told["refined"]["kintas"], " ".join(clogged.out.split())
-    assert printed and float(printed[1]) == pytest.approx(kintas["value"], abs=0.1 * (kintas["high"] - kintas["low"]))
+    diagnosis = json.loads((folder / "clogged.json").read_text())
+    match = re.match(r"MAINTENANCE  Filter clogging requires maintenance: Kintas ([\d.]+)\b", clogged.out)
+    kintas, text = diagnosis["refined"]["kintas"], " ".join(clogged.out.split())
+    assert match and float(match[1]) == pytest.approx(kintas["value"], abs=0.1 * (kintas["high"] - kintas["low"]))
     assert kintas["low"] < CLOGGED["filter.clogging"] < kintas["high"]
     assert [words for words in ("spool friction is acceptable", "0.25 and 0.35", "first overshoot", "first begins",
                                 "simulations", "* marks the ruling fault") if words not in text] == []
-    assert (clogged.status, clogged.err, told["ruling"]) == (1, "", "filter_clogging") and told["events"]
+    assert (clogged.status, clogged.err, diagnosis["ruling"]) == (1, "", "filter_clogging") and diagnosis["events"]
     assert all(set(event) >= {"band", "signal", "t_in", "t_out"} and event["t_in"] < event["t_out"]
-               for event in told["events"])
+               for event in diagnosis["events"])
 
 
 def test_another_command_is_judged_without_bands(folder: Path) -> None:
-    found = diagnose(Trace.read(folder / "short.csv"))
-    assert found.levels == {CLOGGING.name: Level.ACCEPTABLE, FRICTION.name: Level.MAINTENANCE}
-    assert (found.band_verdict, found.events) == (None, ()) and any(note.startswith("no bands") for note in found.notes)
-    assert found.sizes[FRICTION.name].value == pytest.approx(45.0, rel=0.06)
+    diagnosis = diagnose(Trace.read(folder / "short.csv"))
+    assert diagnosis.levels == {CLOGGING.name: Level.ACCEPTABLE, FRICTION.name: Level.MAINTENANCE}
+    assert (diagnosis.band_verdict, diagnosis.events) == (None, ()) and any(
+        note.startswith("no bands") for note in diagnosis.notes)
+    assert diagnosis.sizes[FRICTION.name].value == pytest.approx(45.0, rel=0.06)
 
 
 def test_a_fault_that_only_the_bands_blame_is_explained(folder: Path, tmp_path: Path) -> None:
@@ -335,22 +339,22 @@ def test_a_fault_that_only_the_bands_blame_is_explained(folder: Path, tmp_path: 
 
 def test_nothing_is_blamed_where_something_else_is_wrong() -> None:
     """Spool and ram see a lag of the transducer that no fault and no tolerance explains."""
-    found = diagnose(record_plant({"sensor_lag.time": 3e-3}, SHORT))
-    assert found.verdict == "SOMETHING_ELSE" and found.ruling is None
-    assert all(each in (None, Level.ACCEPTABLE) for each in found.levels.values())
-    assert all(0.0 <= size.low <= size.value <= size.high for size in found.sizes.values())
-    assert "Something else is wrong" in describe_verdict(found)
+    diagnosis = diagnose(record_plant({"sensor_lag.time": 3e-3}, SHORT))
+    assert diagnosis.verdict == "SOMETHING_ELSE" and diagnosis.ruling is None
+    assert all(each in (None, Level.ACCEPTABLE) for each in diagnosis.levels.values())
+    assert all(0.0 <= size.low <= size.value <= size.high for size in diagnosis.sizes.values())
+    assert "Something else is wrong" in describe_verdict(diagnosis)
 
 
 def test_a_gap_is_told(folder: Path, tmp_path: Path) -> None:
     """A quarter of a second is missing while the ram moves on: what is left is judged."""
     trace = Trace.read(folder / "est.csv")
-    there = np.abs(np.arange(len(trace)) - 9824.5) > 125.0
-    holed = {name: np.where(there, trace.column(name), np.nan) for name in ("com", "xj", "cor", "p12", "xs")}
-    Trace.from_columns(holed, trace.period, {}).write_csv(tmp_path / "gap.csv")
-    found = diagnose(Trace.read(tmp_path / "gap.csv"), load_model())
-    assert any("missing in 250 of 13500 rows" in note for note in found.notes)
-    assert all(each in (None, Level.ACCEPTABLE) for each in found.levels.values()) and found.ruling is None
+    is_present = np.abs(np.arange(len(trace)) - 9824.5) > 125.0
+    columns = {name: np.where(is_present, trace.column(name), np.nan) for name in ("com", "xj", "cor", "p12", "xs")}
+    Trace.from_columns(columns, trace.period, {}).write_csv(tmp_path / "gap.csv")
+    diagnosis = diagnose(Trace.read(tmp_path / "gap.csv"), load_model())
+    assert any("missing in 250 of 13500 rows" in note for note in diagnosis.notes)
+    assert all(each in (None, Level.ACCEPTABLE) for each in diagnosis.levels.values()) and diagnosis.ruling is None
 
 
 def test_a_unit_without_leakage_is_judged(folder: Path) -> None:
