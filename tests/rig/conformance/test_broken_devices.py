@@ -120,8 +120,8 @@ def test_another_master_on_the_bus_is_left_alone() -> None:
 def test_other_nodes_are_not_commanded() -> None:
     """A command to all nodes would start them too; the node-ID used as a stranger's is nobody's."""
     outcome = run_cases(make_target(0x700 + 126))
-    skipped = [result.case.number for result in outcome.results if result.verdict is Verdict.SKIPPED]
-    assert (outcome.verdict, skipped, outcome.notes) == ("PASS", ["6.5"], ["Other nodes on the bus: 126."])
+    skipped_cases = [result.case.number for result in outcome.results if result.verdict is Verdict.SKIPPED]
+    assert (outcome.verdict, skipped_cases, outcome.notes) == ("PASS", ["6.5"], ["Other nodes on the bus: 126."])
 
 
 @pytest.mark.parametrize(("section", "old", "new", "found_by", "message"), [
@@ -519,8 +519,8 @@ def test_our_nodes_pass_on_the_embedded_bus(node: str) -> None:
 def test_the_firmware_passes_on_udp(where: str) -> None:
     """Wide limits, for the machine may be busy. Nothing is left behind."""
     result = rig("conformance", "c", "--bus", where, "--json", "--timeout", 20, "--tolerance", 2000)
-    failed = [(test["number"], test["measured"]) for test in result.json["tests"] if test["verdict"] == "fail"]
-    assert (failed, result.err) == ([], "")
+    failures = [(test["number"], test["measured"]) for test in result.json["tests"] if test["verdict"] == "fail"]
+    assert (failures, result.err) == ([], "")
     assert {test["number"] for test in result.json["tests"] if test["verdict"] == "not applicable"} == (
         NOT_FOR_OUR_NODES["controller"])
     assert gone(where)
@@ -532,9 +532,9 @@ def test_files(tmp_path: Path) -> None:
     result = rig("conformance", "plant", "--chapter", 1, "--chapter", "3.6", "--out", out, "--junit", junit)
     assert result.status == 0 and result.out.startswith("PASS  Every applicable test passed (11 of 11).")
     assert "3.6" in result.out and "0x05030000" in result.out
-    told, page = json.loads((out / "conformance.json").read_text()), (out / "conformance.html").read_text()
-    assert (told["node"], told["product"], told["bus"]) == (3, "EHA plant emulator", "embedded")
-    assert [test["number"] for test in told["tests"]][-2:] == ["1.10", "3.6"]
+    report, page = json.loads((out / "conformance.json").read_text()), (out / "conformance.html").read_text()
+    assert (report["node"], report["product"], report["bus"]) == (3, "EHA plant emulator", "embedded")
+    assert [test["number"] for test in report["tests"]][-2:] == ["1.10", "3.6"]
     assert "1 Electronic data sheet" in page and "7.2.4.3.7, table 22" in page and "http" not in page
     suites = ElementTree.parse(junit).getroot()
     assert {suite.get("name"): len(suite) for suite in suites} == {"1 Electronic data sheet": 10, "3 SDO": 1}
@@ -546,8 +546,8 @@ def test_a_failure_is_shown_everywhere(tmp_path: Path) -> None:
     sheet = write_file(tmp_path / "other.eds", EDS[3].read_text().replace("EHA plant emulator", "EHA <other>"))
     result = rig("conformance", "plant", "--eds", sheet, "--chapter", 2, "--junit", junit, "--out", tmp_path)
     assert result.status == 1 and result.out.startswith("FAIL  1 test failed: 2.3.") and "2.3 fail" in result.out
-    (failed,) = ElementTree.parse(junit).getroot().findall(".//testcase[failure]")
-    assert failed.get("name") == "2.3 constants" and "EHA <other>" in str(failed[0].get("message"))
+    (testcase,) = ElementTree.parse(junit).getroot().findall(".//testcase[failure]")
+    assert testcase.get("name") == "2.3 constants" and "EHA <other>" in str(testcase[0].get("message"))
     assert "EHA &lt;other&gt;" in (tmp_path / "conformance.html").read_text()
 
 
@@ -592,5 +592,5 @@ def test_the_firmware_passes_on_a_can_interface(bus_kind: str) -> None:
     words = [word for number in numbers for word in ("--chapter", number)]
     result = rig("conformance", "c", "--bus", spec(bus_kind), "--json", "--timeout", 20, "--tolerance", 2000, *words)
     assert [test["number"] for test in result.json["tests"]] == numbers
-    failed = [(test["number"], test["measured"]) for test in result.json["tests"] if test["verdict"] == "fail"]
-    assert (failed, result.status) == ([], 0)
+    failures = [(test["number"], test["measured"]) for test in result.json["tests"] if test["verdict"] == "fail"]
+    assert (failures, result.status) == ([], 0)
