@@ -66,8 +66,8 @@ def test_the_package_has_everything(runs: Path) -> None:
     assert [run["name"] for run in index["runs"]] == ["run", "suite/short-seed-1", "suite/short-seed-2"]
     assert all(run["verdict"] == "PASS" and run["machine"]["system"] and not run["other_versions"]
                for run in index["runs"])
-    found = {each["id"]: (each["verdict"], len(each["checks"])) for each in index["requirements"]}
-    assert found == {"REQ-1": ("PASS", 3), "REQ-2": ("PASS", 5), "REQ-3": ("NOT_COVERED", 0)}
+    requirements = {each["id"]: (each["verdict"], len(each["checks"])) for each in index["requirements"]}
+    assert requirements == {"REQ-1": ("PASS", 3), "REQ-2": ("PASS", 5), "REQ-3": ("NOT_COVERED", 0)}
     assert (runs / "pack/inputs/run/bench/eha.toml").is_file() and (runs / "pack/inputs/run/model.toml").is_file()
     assert (runs / "pack/runs/suite/suite.json").is_file()
     bill = json.loads((runs / "pack/sbom.cdx.json").read_text())
@@ -154,10 +154,10 @@ def test_bad_packages_are_refused_in_one_line(runs: Path, package: Path, tmp_pat
 
 
 def test_bad_input_of_packing_is_refused(runs: Path, tmp_path: Path) -> None:
-    forged = Path(shutil.copytree(runs / "run", tmp_path / "run"))
-    told = json.loads((forged / "verdict.json").read_text())
-    told["checks"][0]["value"] += 1.0
-    (forged / "verdict.json").write_text(json.dumps(told))
+    forgery = Path(shutil.copytree(runs / "run", tmp_path / "run"))
+    verdict = json.loads((forgery / "verdict.json").read_text())
+    verdict["checks"][0]["value"] += 1.0
+    (forgery / "verdict.json").write_text(json.dumps(verdict))
     (tmp_path / "other.csv").write_text("id\nREQ-1\n")
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/verdict.json").write_text("[]")
@@ -165,7 +165,7 @@ def test_bad_input_of_packing_is_refused(runs: Path, tmp_path: Path) -> None:
     out = ("--out", tmp_path / "x.zip")
     for words, line in (
             ((), "at least one folder of a run"), ((tmp_path / "none", *out), "the folder of a run or suite"),
-            ((forged, *out), "verdict: expected what its log says, PASS, check by check"),
+            ((forgery, *out), "verdict: expected what its log says, PASS, check by check"),
             ((tmp_path / "broken", *out), "the verdict of a run by this version"),
             ((runs / "run", "--out", runs / "run/x.zip"), "a place outside the runs"),
             ((runs / "run", "--out", runs / "pack"), "a FILE.zip, or a folder that is new or empty"),
@@ -183,7 +183,7 @@ def test_a_run_with_requirements_shows_their_coverage(runs: Path, tmp_path: Path
     assert "REQ-1" in (tmp_path / "suite.html").read_text()
 
 
-@pytest.mark.parametrize(("name", "text", "expected"), [
+@pytest.mark.parametrize(("name", "text", "outcome"), [
     ("r.csv", CSV, {"REQ-1": "A step overshoots by at most 30 %", "REQ-2": "No; emergency",
                     "REQ-3": "Nobody checks this"}),
     ("r.csv", "Requirement\tText\nA\tx\n", {"A": "x"}), ("r.csv", "id\nA\nB\n", {"A": "", "B": ""}),
@@ -194,12 +194,12 @@ def test_a_run_with_requirements_shows_their_coverage(runs: Path, tmp_path: Path
     ("r.xlsx", "", "a .csv or .reqif file"), ("r.reqif", "<a>", "r.reqif:1: expected ReqIF, which is XML"),
     ("r.reqif", "<a/>", "REQ-IF as outermost element, not a"),
     ("r.reqif", '<!DOCTYPE a [<!ENTITY b "c">]><a/>', "without a document type")])
-def test_requirements(name: str, text: str, expected: Any, tmp_path: Path) -> None:
+def test_requirements(name: str, text: str, outcome: Any, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
-    if isinstance(expected, dict):
-        assert read_requirements(tmp_path / name) == expected
+    if isinstance(outcome, dict):
+        assert read_requirements(tmp_path / name) == outcome
     else:
-        assert expected in catch_refusal(read_requirements, tmp_path / name)
+        assert outcome in catch_refusal(read_requirements, tmp_path / name)
 
 
 @pytest.mark.skipif(not shutil.which("gpg"), reason="no gpg")
@@ -211,17 +211,17 @@ def test_a_package_signed_by_gpg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         subprocess.run(["gpg", "--batch", "--quiet", "--passphrase", "", "--quick-generate-key", who, "ed25519"],
                        check=True, capture_output=True)
     keys = subprocess.run(["gpg", "--list-keys", "--with-colons"], capture_output=True, text=True, check=True).stdout
-    own, other = (line.split(":")[9] for line in keys.splitlines() if line.startswith("fpr:"))
+    own_key, other_key = (line.split(":")[9] for line in keys.splitlines() if line.startswith("fpr:"))
     package = tmp_path / "p"
     write_package({"a": b"one"}, package, "lab@example.org", ignore_progress)
-    assert "valid, by" in verify_package(package).signature and verify_package(package, own).is_intact
-    assert not verify_package(package, other).is_intact
+    assert "valid, by" in verify_package(package).signature and verify_package(package, own_key).is_intact
+    assert not verify_package(package, other_key).is_intact
     (package / "a").write_text("two")  # and a manifest made anew
     again = tmp_path / "q"
     write_package({"a": b"two"}, again, "", ignore_progress)
     shutil.copy(again / "MANIFEST.sha256", package)
     assert verify_package(package).changed == ["MANIFEST.sha256.asc (not a valid signature by a key)"]
-    assert verify_package(again, own).missing == [f"a signature by {own}"]
+    assert verify_package(again, own_key).missing == [f"a signature by {own_key}"]
     subprocess.run(["gpgconf", "--kill", "gpg-agent"], check=False)
     assert "a key with which gpg signs" in catch_refusal(
         write_package, {}, tmp_path / "r", "nobody@example.org", ignore_progress)
