@@ -90,12 +90,12 @@ def test_it_reads_what_python_can_packs(frame: tuple[int, bytes], is_named: bool
 @given(frames)
 def test_python_can_reads_what_it_packs(frame: tuple[int, bytes]) -> None:
     cob_id, data = frame
-    packed = (ctypes.c_uint8 * 256)()
+    datagram = (ctypes.c_uint8 * 256)()
     size = load_datagrams().datagram_pack(
-        ctypes.byref(CFrame(0, cob_id, len(data), (ctypes.c_uint8 * 8)(*data))), packed)
-    message = unpack_message(bytes(packed[:size]), check=True)
-    expected = make_message(frame)
-    assert message.equals(expected, timestamp_delta=None, check_direction=False)
+        ctypes.byref(CFrame(0, cob_id, len(data), (ctypes.c_uint8 * 8)(*data))), datagram)
+    message = unpack_message(bytes(datagram[:size]), check=True)
+    original = make_message(frame)
+    assert message.equals(original, timestamp_delta=None, check_direction=False)
 
 
 @pytest.mark.parametrize("flags", [
@@ -109,12 +109,12 @@ def test_it_leaves_out_other_frames(flags: dict[str, bool]) -> None:
 @given(frames, st.integers(0, 200), st.integers(0, 255))
 def test_a_damaged_datagram_gives_at_most_a_frame_of_eight_bytes(frame: tuple[int, bytes], at: int, byte: int) -> None:
     """Undefined behaviour ends the process, because the library is built with its sanitizer."""
-    packed = bytearray(pack_message(make_message(frame)))
-    packed[at % len(packed)] = byte
-    found = unpack(bytes(packed))
-    assert found is None or (len(found[1]) <= 8 and (found[0] <= 0x7FF or found[0] & EXTENDED))
+    datagram = bytearray(pack_message(make_message(frame)))
+    datagram[at % len(datagram)] = byte
+    reading = unpack(bytes(datagram))
+    assert reading is None or (len(reading[1]) <= 8 and (reading[0] <= 0x7FF or reading[0] & EXTENDED))
 
 
 def test_a_datagram_that_was_cut_is_no_frame() -> None:
-    packed = pack_message(make_message((EXTENDED | 0x18FF0105, bytes(8))))
-    assert [cut for cut in range(len(packed)) if unpack(packed[:cut])] == []
+    datagram = pack_message(make_message((EXTENDED | 0x18FF0105, bytes(8))))
+    assert [cut for cut in range(len(datagram)) if unpack(datagram[:cut])] == []

@@ -196,8 +196,8 @@ def make_sdo(draw: random.Random, objects: list[tuple[int, int]]) -> Iterator[tu
         yield 0x602, bytes((0x23 | 4 - size << 2,)) + head + (value & (1 << 8 * size) - 1).to_bytes(4, "little")
     elif kind < 0.9:
         value = struct.pack("<d", draw.choice((3.8, 0.0, 30.0, 1e-3, -1.0, 1e300, float("nan"), float("inf"))))
-        announced = draw.choice((8, 8, 8, 0, 7, 9, 1 << 30))
-        yield 0x602, (b"\x21" if announced else b"\x20") + head + announced.to_bytes(4, "little")
+        announced_size = draw.choice((8, 8, 8, 0, 7, 9, 1 << 30))
+        yield 0x602, (b"\x21" if announced_size else b"\x20") + head + announced_size.to_bytes(4, "little")
         yield 0x602, b"\x00" + value[:7]
         yield 0x602, (b"\x1d" if draw.random() < 0.9 else b"\x1b") + value[7:] + bytes(6)
     else:
@@ -206,16 +206,16 @@ def make_sdo(draw: random.Random, objects: list[tuple[int, int]]) -> Iterator[tu
 
 def run_in_python(script: list[Frame]) -> list[tuple[int, int, bytes]]:
     """What the built-in firmware sends: time, COB-ID, data."""
-    sent: list[tuple[int, int, bytes]] = []
+    frames: list[tuple[int, int, bytes]] = []
     now = [0]
-    firmware = Firmware(lambda cob_id, data: sent.append((now[0], cob_id, data)))
+    firmware = Firmware(lambda cob_id, data: frames.append((now[0], cob_id, data)))
     for frame in script:
         now[0] = frame.t_ns
         if frame.cob_id == TICK:
             firmware.tick(frame.t_ns)
         else:
             firmware.receive(frame)
-    return sent
+    return frames
 
 
 def run_in_c(script: list[Frame]) -> list[tuple[int, int, bytes]]:
@@ -232,12 +232,13 @@ def run_in_c(script: list[Frame]) -> list[tuple[int, int, bytes]]:
 @pytest.mark.parametrize("seed", range(2))
 def test_same_answers_to_a_random_script(seed: int) -> None:
     script = make_script(seed, 40_000)
-    expected, sent = run_in_python(script), run_in_c(script)
-    different = next((k for k, pair in enumerate(zip(expected, sent, strict=False)) if pair[0] != pair[1]), None)
-    assert different is None, (expected[different], sent[different])
-    assert len(sent) == len(expected)
-    kinds = {cob_id for _, cob_id, _ in sent}
+    python_frames, c_frames = run_in_python(script), run_in_c(script)
+    different = next((k for k, pair in enumerate(zip(python_frames, c_frames, strict=False)) if pair[0] != pair[1]),
+                     None)
+    assert different is None, (python_frames[different], c_frames[different])
+    assert len(c_frames) == len(python_frames)
+    kinds = {cob_id for _, cob_id, _ in c_frames}
     assert kinds >= {0x082, 0x182, 0x582, 0x702}
-    currents = {data[:4] for _, cob_id, data in sent if cob_id == 0x182}
-    aborts = {data[4:] for _, cob_id, data in sent if cob_id == 0x582 and data[0] == 0x80}
+    currents = {data[:4] for _, cob_id, data in c_frames if cob_id == 0x182}
+    aborts = {data[4:] for _, cob_id, data in c_frames if cob_id == 0x582 and data[0] == 0x80}
     assert len(currents) > 500 and len(aborts) >= 9
