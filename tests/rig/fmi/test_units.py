@@ -68,17 +68,17 @@ def test_a_unit_is_valid_and_has_the_bits_of_rig_simulate(
 
     path, model = unit(name, version), choose_model(name)
     assert validate_fmu(str(path)) == []
-    expected = simulate(model, COMMAND, LOAD, seed=7)
-    drive = np.r_[0.0, expected.cor[:-1]]
+    reference = simulate(model, COMMAND, LOAD, seed=7)
+    drive = np.r_[0.0, reference.cor[:-1]]
     outputs = [signal.name for signal in model.kind.signals.outputs]
     rows = np.array(list(zip(T, COMMAND, drive, LOAD, strict=True)),
                     [(column, float) for column in ("time", "com", "cor", "load")])
     for is_closed in (True, False):
-        found = fmpy.simulate_fmu(str(path), stop_time=T[-1], step_size=1e-3, output_interval=1e-3, input=rows,
-                                  start_values={"closed_loop": is_closed}, output=[*outputs, "answer"])
+        unit_rows = fmpy.simulate_fmu(str(path), stop_time=T[-1], step_size=1e-3, output_interval=1e-3, input=rows,
+                                      start_values={"closed_loop": is_closed}, output=[*outputs, "answer"])
         for signal in outputs:
-            assert found[signal].tobytes() == getattr(expected, signal).tobytes(), (signal, is_closed)
-    assert np.ptp(expected.xj) > 1e-3
+            assert unit_rows[signal].tobytes() == getattr(reference, signal).tobytes(), (signal, is_closed)
+    assert np.ptp(reference.xj) > 1e-3
 
 
 def test_a_unit_needs_no_interpreter_and_two_exports_are_one_file(
@@ -93,17 +93,17 @@ def test_a_unit_needs_no_interpreter_and_two_exports_are_one_file(
         archive.extractall(tmp_path)
     description = (tmp_path / "modelDescription.xml").read_text()
     (guid,) = re.findall(r'guid="([^"]+)"', description)
-    ((first, _), *_) = found = re.findall(r'valueReference="(\d+)"[^>]+causality="(output)"', description)
+    ((first, _), *_) = outputs = re.findall(r'valueReference="(\d+)"[^>]+causality="(output)"', description)
     (seed_at,) = re.findall(r'name="seed" valueReference="(\d+)"', description)
     driver = tmp_path / "drive_fmu"
     source = Path(__file__).parents[2] / "support" / "drive_fmu.c"
     subprocess.run(["cc", str(source), "-o", str(driver), "-ldl"], check=True)
-    words = [driver, tmp_path / "binaries" / platforms[0] / "eha.so", guid, 7, 1e-3, first, len(found) - 1, seed_at]
+    words = [driver, tmp_path / "binaries" / platforms[0] / "eha.so", guid, 7, 1e-3, first, len(outputs) - 1, seed_at]
     result = subprocess.run([str(word) for word in words], input="\n".join(x.hex() for x in COMMAND.tolist()),
                           capture_output=True, text=True, check=True)
     rows = np.array([[float.fromhex(word) for word in line.split()] for line in result.stdout.splitlines()])
-    expected = simulate(choose_model("nominal"), COMMAND, seed=7)
-    assert rows.tobytes() == np.column_stack([expected.xj, expected.p12, expected.xs]).tobytes()
+    reference = simulate(choose_model("nominal"), COMMAND, seed=7)
+    assert rows.tobytes() == np.column_stack([reference.xj, reference.p12, reference.xs]).tobytes()
 
 
 class Instance:
@@ -137,17 +137,17 @@ class Instance:
 
     def get(self, name: str) -> float:
         """A real variable."""
-        found = (self.fmu.getReal if self.is_old else self.fmu.getFloat64)([self.places[name]])
-        return float(found[0])
+        values = (self.fmu.getReal if self.is_old else self.fmu.getFloat64)([self.places[name]])
+        return float(values[0])
 
     def run(self, first: int, cycles: int) -> list[float]:
         """XJ of some cycles under a current that changes."""
-        found = []
+        positions = []
         for k in range(first, first + cycles):
             self.set("cor", 2e-3 * np.sin(k / 9))
             self.fmu.doStep(k * 1e-3, 1e-3)
-            found.append(self.get("xj"))
-        return found
+            positions.append(self.get("xj"))
+        return positions
 
 
 def is_refused(call: Callable[..., object], *words: object) -> bool:
@@ -171,15 +171,15 @@ def test_states_are_saved_restored_and_serialised(make_instance: Callable[[], In
     one.start()
     other.start()
     one.run(0, 50)
-    saved = one.fmu.getFMUState()
+    state = one.fmu.getFMUState()
     onward = one.run(50, 50)
-    one.fmu.setFMUState(saved)
+    one.fmu.setFMUState(state)
     assert one.run(50, 50) == onward
-    data = one.fmu.serializeFMUState(saved)
+    data = one.fmu.serializeFMUState(state)
     other.fmu.setFMUState(other.fmu.deserializeFMUState(data))
     assert other.run(50, 50) == onward
     assert all(is_refused(other.fmu.deserializeFMUState, each) for each in (data[:-1], bytes(len(data))))
-    one.fmu.freeFMUState(saved)
+    one.fmu.freeFMUState(state)
     one.fmu.reset()
     one.start()
     first = one.run(0, 50)
@@ -220,9 +220,9 @@ def test_messages_reach_the_logger(unit: Callable[[str, str], Path], tmp_path: P
 
     path = unit("nominal", "3")
     messages: list[str] = []
-    described = fmpy.read_model_description(str(path))
-    slave = FMU3Slave(guid=described.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path)),
-                      modelIdentifier=described.coSimulation.modelIdentifier, instanceName="unit")
+    description = fmpy.read_model_description(str(path))
+    slave = FMU3Slave(guid=description.guid, unzipDirectory=fmpy.extract(str(path), str(tmp_path)),
+                      modelIdentifier=description.coSimulation.modelIdentifier, instanceName="unit")
     slave.instantiate(logMessage=fmi3LogMessageCallback(lambda _e, _s, _c, text: messages.append(text.decode())))
     with pytest.raises(Exception, match="fmi3DoStep"):
         slave.doStep(0.0, 1e-3)
@@ -236,10 +236,10 @@ def test_messages_reach_the_logger(unit: Callable[[str, str], Path], tmp_path: P
 @needs_compiler
 def test_rig_export_writes_units_and_refuses_bad_words(tmp_path: Path) -> None:
     out = tmp_path / "unit.fmu"
-    found = answer("export", "--fmu", out, "--fmi", "3", "--set", "spool.static_friction=35")
-    assert (found["path"], found["fmi"]) == (str(out), "3") and found["platforms"]
-    described = fmpy.read_model_description(str(out))
-    (friction,) = [v for v in described.modelVariables if v.name == "spool.static_friction"]
+    export = answer("export", "--fmu", out, "--fmi", "3", "--set", "spool.static_friction=35")
+    assert (export["path"], export["fmi"]) == (str(out), "3") and export["platforms"]
+    description = fmpy.read_model_description(str(out))
+    (friction,) = [v for v in description.modelVariables if v.name == "spool.static_friction"]
     assert (float(friction.start), friction.unit, friction.variability) == (35.0, "N", "tunable")
     assert "a file that does not exist yet" in refuse("export", "--fmu", out)
     assert "a file .fmu" in refuse("export", "--fmu", tmp_path / "unit.zip")
@@ -326,17 +326,17 @@ def folder(here: Path) -> Path:
 @pytest.mark.parametrize("version", [pytest.param("2", marks=pytest.mark.slow), "3"])
 def test_the_exported_eha_gives_its_own_rows_again(folder: Path, version: str) -> None:
     export_fmu(load_model(), Path("eha.fmu"), version)
-    own, again = load_model(), load_model("eha.fmu")
+    plain_model, unit_model = load_model(), load_model("eha.fmu")
     com = 1e-3 * np.sin(np.arange(600) / 50)
     load = 800 * np.cos(np.arange(600) / 70)
     changes = {"spool.static_friction": 25.0}
-    expected = simulate(own.replace(changes), com, load, seed=3)
-    found = simulate(again.replace(changes), com, load, seed=3)
-    assert [a.tobytes() for a in found] == [b.tobytes() for b in expected]
+    reference = simulate(plain_model.replace(changes), com, load, seed=3)
+    unit_run = simulate(unit_model.replace(changes), com, load, seed=3)
+    assert [a.tobytes() for a in unit_run] == [b.tobytes() for b in reference]
     values = np.array([[20.0], [40.0]])
     quiet = dict.fromkeys(("sensors.position_noise", "sensors.pressure_noise", "sensors.spool_noise"), 0.0)
     runs = [Lanes(model.replace(quiet), ["spool.static_friction"], 100).replay(
-        values, expected.cor, load, expected.xj, 5.0) for model in (own, again)]
+        values, reference.cor, load, reference.xj, 5.0) for model in (plain_model, unit_model)]
     assert (np.abs(runs[1] - runs[0]) <= 1e-12 * np.abs(runs[0]).max(axis=(0, 1))).all()
     bench = (ROOT / "rig" / "benches" / "eha.toml").read_text().replace('plant = "eha"', 'plant = "eha.fmu"')
     for eds in (ROOT / "dbc").glob("*.eds"):
@@ -382,30 +382,30 @@ def test_identify_finds_the_parameters_that_the_map_gives_a_range_also_where_tri
     Path("command.csv").write_text("\n".join(start))
     answer("simulate", "--model", "slide.toml", "--command", "command.csv", "--set", "drive.gain=2.4", "--out",
            "run.csv")
-    found = answer("identify", "run.csv", "--model", "slide.toml", "--out", "found.toml")
-    assert found["parameters"]["drive.gain"]["value"] == pytest.approx(2.4, rel=0.01)
+    identification = answer("identify", "run.csv", "--model", "slide.toml", "--out", "found.toml")
+    assert identification["parameters"]["drive.gain"]["value"] == pytest.approx(2.4, rel=0.01)
 
 
-@pytest.mark.parametrize(("fault", "expected"), [
+@pytest.mark.parametrize(("fault", "message"), [
     ({"does": "CRASH", "at": 100}, "the unit crashed in step (SIGSEGV); its last message: about to fail"),
     ({"does": "HANG", "at": 100}, "the unit has not answered for 4 s in step; it was stopped"),
     ({"does": "REFUSE", "at": 100}, "at 0.1 s; its message: the solver did not converge"),
     ({"does": "GIVE_NAN", "at": 100}, "the unit gives nan for xj at 0.101 s"),
 ])
 def test_a_unit_that_breaks_ends_the_run_with_a_verdict_and_a_readable_log(
-    folder: Path, fault: dict[str, Any], expected: str, monkeypatch: pytest.MonkeyPatch
+    folder: Path, fault: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     build_fmu(Path("slide.fmu"), **fault)
     monkeypatch.setattr(foreign, "LONGEST_CALL", 4.0)  # loading takes a second on a busy machine
-    assert expected in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
+    assert message in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
     result = rig("run", "short.toml", "--model", "slide.toml", "--out", "run", "--quiet")
     assert result.status == 1, result
     verdict = json.loads(Path("run", "verdict.json").read_text())
-    assert verdict["verdict"] == "ABORTED" and expected in json.dumps(verdict)
+    assert verdict["verdict"] == "ABORTED" and message in json.dumps(verdict)
     assert len(Trace.read("run", all=True)) > 50
 
 
-@pytest.mark.parametrize(("kind", "expected"), [
+@pytest.mark.parametrize(("kind", "message"), [
     ({"platform": "win64"}, "slide.so; it has only binaries/win64/slide.so"),
     ({"sources": True}, "it has none and source code: python -m fmpy compile slide.fmu"),
     ({"fmi": "1.0"}, "fmiVersion: expected 2.0 or 3.0, not 1.0"),
@@ -416,12 +416,12 @@ def test_a_unit_that_breaks_ends_the_run_with_a_verdict_and_a_readable_log(
     ({"does": "TOKEN"}, "at 0 s; the guid, or instantiationToken, in its modelDescription.xml may not"),
     ({"does": "END", "at": 3}, "the unit asks to end the simulation"),
 ])
-def test_a_unit_that_cannot_run_here_is_refused(folder: Path, kind: dict[str, Any], expected: str) -> None:
+def test_a_unit_that_cannot_run_here_is_refused(folder: Path, kind: dict[str, Any], message: str) -> None:
     build_fmu(Path("slide.fmu"), **kind)
-    assert expected in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
+    assert message in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
 
 
-@pytest.mark.parametrize(("old", "new", "expected"), [  # replaced in SLIDE
+@pytest.mark.parametrize(("old", "new", "message"), [  # replaced in SLIDE
     ('file = "slide.fmu"', 'file = "none.fmu"', "none.fmu: expected an FMU; it does not exist"),
     ('file = "slide.fmu"', 'file = "slide.toml"', "an FMU, a zip archive with a modelDescription.xml"),
     ('"slide.x"', '"slide.y"', "a variable of slide.fmu, not 'slide.y'; did you mean slide.x?"),
@@ -435,10 +435,10 @@ def test_a_unit_that_cannot_run_here_is_refused(folder: Path, kind: dict[str, An
     ("gain = 2.0\n", "", "or drive.gain in this file: a number from 0.5 to 10; the unit has 0"),
     ("gain = 2.0", "is_big = 0.5\ngain = 2.0", "drive.is_big: expected a whole number from 0 to 1, not 0.5"),
 ])
-def test_a_wrong_map_is_refused_with_its_line(folder: Path, old: str, new: str, expected: str) -> None:
+def test_a_wrong_map_is_refused_with_its_line(folder: Path, old: str, new: str, message: str) -> None:
     build_fmu(Path("slide.fmu"))
     Path("slide.toml").write_text(SLIDE.replace(old, new))
-    assert expected in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
+    assert message in refuse("simulate", "--model", "slide.toml", "--command", "command.csv", "--out", "run.csv")
 
 
 @pytest.mark.parametrize("version", ["2", "3"])
@@ -459,8 +459,8 @@ def test_a_drive_of_its_own_has_no_limit_of_the_shipped_actuator(folder: Path) -
 
 def test_a_run_has_the_period_of_the_model_file(folder: Path) -> None:
     build_fmu(Path("slide.fmu"))
-    own = SLIDE.replace("current =", "torque =").replace("1 mA", "1 N m").replace("ram_position", "angle")
-    Path("own.toml").write_text(own.replace("[controller]", "[controller]\nperiod = 2e-3"))
+    model_text = SLIDE.replace("current =", "torque =").replace("1 mA", "1 N m").replace("ram_position", "angle")
+    Path("own.toml").write_text(model_text.replace("[controller]", "[controller]\nperiod = 2e-3"))
     assert rig("run", "short.toml", "--model", "own.toml", "--out", "run").status == 0
 
 
