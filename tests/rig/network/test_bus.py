@@ -76,15 +76,15 @@ class TestEveryBus:
     def test_frames_of_all_kinds_reach_everybody_but_their_sender_unchanged_and_in_order(self, bus_kind: str) -> None:
         identifiers = [cob_id | wide for cob_id in (0, 0x7F, 0x80, 0x182, 0x7FF) for wide in (0, EXTENDED)]
         identifiers += [EXTENDED | 0x800, EXTENDED | 0x18FEF1AB, EXTENDED | 0x1FFFFFFF]
-        sent = [(cob_id, bytes(range(0xF0, 0xF0 + length))) for length in (0, 1, 8) for cob_id in identifiers]
-        sent += [(cob_id | FD, data) for cob_id, data in sent]
-        sent += [(cob_id | FD, bytes(range(length))) for length in FD_LENGTHS for cob_id in identifiers]
-        sent += [(n % 0x700, struct.pack("<I", n)) for n in range(150)]
+        frames = [(cob_id, bytes(range(0xF0, 0xF0 + length))) for length in (0, 1, 8) for cob_id in identifiers]
+        frames += [(cob_id | FD, data) for cob_id, data in frames]
+        frames += [(cob_id | FD, bytes(range(length))) for length in FD_LENGTHS for cob_id in identifiers]
+        frames += [(n % 0x700, struct.pack("<I", n)) for n in range(150)]
         with stations(bus_kind, fd=True) as (sender, *others):
-            for cob_id, data in sent:
+            for cob_id, data in frames:
                 sender.send(cob_id | SWITCHED if cob_id & FD else cob_id, data)
             for station in others:
-                assert contents(gather(station, len(sent))) == sent
+                assert contents(gather(station, len(frames))) == frames
             assert sender.poll(0.02) == []
 
     def test_silent_bus_gives_nothing(self, bus_kind: str) -> None:
@@ -106,8 +106,8 @@ class TestLink:
                 receiver.leave_out(left_out)
                 for cob_id in (*identifiers, 0x123):
                     sender.send(cob_id, b"1")
-                expected = [cob_id for cob_id in identifiers if cob_id not in left_out]
-                assert [frame.cob_id for frame in gather(receiver, len(expected) + 1)] == [*expected, 0x123]
+                arrivals = [cob_id for cob_id in identifiers if cob_id not in left_out]
+                assert [frame.cob_id for frame in gather(receiver, len(arrivals) + 1)] == [*arrivals, 0x123]
             receiver.send(0x100, b"2")
             assert gather(receiver, 1, timeout=0.05) == []
 
@@ -144,13 +144,13 @@ class TestLink:
             for flags in ({}, {"is_fd": True}, {"is_fd": True, "bitrate_switch": True}):
                 for is_extended in (False, True):
                     data = bytes(64 if flags else 8)
-                    sent = can.Message(arbitration_id=0x123, is_extended_id=is_extended, data=data, **flags)
-                    other.send(sent)
+                    message = can.Message(arbitration_id=0x123, is_extended_id=is_extended, data=data, **flags)
+                    other.send(message)
                     (frame,) = gather(link, 1)
-                    assert frame.cob_id == find_cob_id(sent) & ~SWITCHED and frame.data == data
-                    link.send(find_cob_id(sent), data)
-                    heard = other.recv(60)
-                    assert heard.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False)
+                    assert frame.cob_id == find_cob_id(message) & ~SWITCHED and frame.data == data
+                    link.send(find_cob_id(message), data)
+                    echo = other.recv(60)
+                    assert echo.equals(message, timestamp_delta=None, check_channel=False, check_direction=False)
 
     @links
     def test_nodes_are_selected_by_classical_frames(self, bus_kind: str) -> None:
@@ -187,10 +187,10 @@ class TestLink:
             make_buffer_small(bus.fileno())
             for n in range(3000):
                 sender.send(0x100, struct.pack("<I", n))
-            kept = sum(len(frames) for frames in iter(lambda: receiver.poll(0.5), []))  # some come late
+            arrivals = sum(len(frames) for frames in iter(lambda: receiver.poll(0.5), []))  # some come late
             sender.send(0x101, b"")  # the count rides on the next frame
             gather(receiver, 1)
-            assert kept > 0 < receiver.overflows and kept + receiver.overflows + sender.unsent == 3000
+            assert arrivals > 0 < receiver.overflows and arrivals + receiver.overflows + sender.unsent == 3000
 
     @only_socketcan
     def test_time_is_that_of_reception_not_of_polling(self, bus_kind: str) -> None:
@@ -198,10 +198,10 @@ class TestLink:
             begin = time.monotonic_ns()
             sender.send(0x100, b"")
             sender.send(0x101, b"")
-            sent = time.monotonic_ns() - begin
+            send_time = time.monotonic_ns() - begin
             time.sleep(0.1)
             first, second = gather(receiver, 2)
-            assert 0 <= second.t_ns - first.t_ns <= sent + 100_000
+            assert 0 <= second.t_ns - first.t_ns <= send_time + 100_000
 
     @pytest.mark.parametrize("use", [lambda link: link.send(0x80, b""), Link.poll], ids=["send", "poll"])
     def test_a_bus_that_is_gone_is_one_line(self, use: Callable[[Link], object]) -> None:
@@ -239,11 +239,11 @@ def test_auto_is_embedded_and_says_why(live: list[str], more: str, monkeypatch: 
     assert choose_bus() == ("embedded", f"embedded bus (neither --bus nor EHA_RIG_BUS is set){more}")
 
 
-@pytest.mark.parametrize("taken", ["embedded", "virtual", "virtual:x", "udp_multicast", "udp_multicast:239.1.2.3"])
-def test_asked_or_configured(taken: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert choose_bus(taken) == (taken, f"{taken}, as asked")
-    monkeypatch.setenv(bus_module.BUS_VARIABLE, taken)
-    assert choose_bus("auto") == (taken, f"{taken}, as EHA_RIG_BUS says")
+@pytest.mark.parametrize("bus", ["embedded", "virtual", "virtual:x", "udp_multicast", "udp_multicast:239.1.2.3"])
+def test_asked_or_configured(bus: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert choose_bus(bus) == (bus, f"{bus}, as asked")
+    monkeypatch.setenv(bus_module.BUS_VARIABLE, bus)
+    assert choose_bus("auto") == (bus, f"{bus}, as EHA_RIG_BUS says")
     assert choose_bus("virtual:y")[0] == "virtual:y"  # asking beats the variable
 
 
@@ -312,8 +312,8 @@ def frame(cob_id: int, data: bytes = b"\1\2\3") -> can.Message:
 
 def test_it_is_registered_where_python_can_looks() -> None:
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
-    declared = EntryPoint("eha_rig_udp", groups["can.interface"]["eha_rig_udp"], "can.interface")
-    assert declared.load() is UdpBus
+    entry_point = EntryPoint("eha_rig_udp", groups["can.interface"]["eha_rig_udp"], "can.interface")
+    assert entry_point.load() is UdpBus
     with can.Bus(interface="eha_rig_udp", channel=find_group(), bitrate=1_000_000) as bus:
         assert type(bus) is UdpBus
 
@@ -325,9 +325,9 @@ def test_a_message_has_the_time_of_its_reception_and_passes_the_filters() -> Non
         before = time.time()
         for cob_id in (0x80, 0x182, 0x183):
             other.send(frame(cob_id))
-        heard = bus.recv(60.0)
-        assert heard is not None and heard.arbitration_id == 0x182 and before <= heard.timestamp <= time.time()
-        assert group in str(heard.channel) and bus.recv(0.1) is None
+        message = bus.recv(60.0)
+        assert message is not None and message.arbitration_id == 0x182 and before <= message.timestamp <= time.time()
+        assert group in str(message.channel) and bus.recv(0.1) is None
 
 
 @pytest.mark.parametrize(("options", "words"), [
@@ -416,8 +416,8 @@ class TestFrames:
             for length in (*range(9), *FD_LENGTHS):
                 data = bytes(range(0xF8 - length, 0xF8))
                 for cob_id in [each for each in cob_ids if has_valid_length(each, length)]:
-                    sent = make_message(cob_id, data)
-                    other.send(sent)
+                    message = make_message(cob_id, data)
+                    other.send(message)
                     status, t_ns, *rest = receive(bus.port, soon())
                     assert (status, *rest) == (FRAME, cob_id & ~SWITCHED, length, payload(data[:8]))
                     assert bytes(bus.port.octets[PAYLOAD_IN: PAYLOAD_IN + length]) == data
@@ -427,34 +427,34 @@ class TestFrames:
                     if length <= 8:
                         assert function("send_frame")(bus.port, cob_id, length, payload(data)) == SENT
                     for _ in range(1 + (length <= 8)):
-                        heard = other.recv(60)
-                        assert heard.equals(sent, timestamp_delta=None, check_channel=False, check_direction=False)
+                        echo = other.recv(60)
+                        assert echo.equals(message, timestamp_delta=None, check_channel=False, check_direction=False)
 
     def test_only_the_kinds_asked_for_arrive(self, where: str) -> None:
         """One number is four identifiers: of 11 or 29 bits, classical or CAN FD."""
         kinds = (0, EXTENDED, FD, EXTENDED | FD)
         with open_can(where, fd=True) as other:
-            for wanted in kinds:
-                with RawBus(where, [number | wanted for number in (0x12, 0xFF, 0x183)], fd=True) as bus:
+            for filter_kind in kinds:
+                with RawBus(where, [number | filter_kind for number in (0x12, 0xFF, 0x183)], fd=True) as bus:
                     for kind in kinds:
                         for number in (0x12, 0x13, 0xFF, 0x182, 0x183):
                             other.send(make_message(number | kind, b"\1"))
-                    assert receive_all(bus.port) == [number | wanted for number in (0x12, 0xFF, 0x183)]
+                    assert receive_all(bus.port) == [number | filter_kind for number in (0x12, 0xFF, 0x183)]
                     bus.set_filter([EXTENDED | 0x12345678, 0x80])
                     for number in (0x12, EXTENDED | 0x12345678, EXTENDED | 0x12345679, FD | 0x80, 0x80):
                         other.send(make_message(number, b""))
                     assert receive_all(bus.port) == [EXTENDED | 0x12345678, 0x80]
 
     def test_only_the_frames_asked_for_arrive_and_none_of_its_own(self, where: str, other: can.BusABC) -> None:
-        wanted = [0x000, 0x050, 0x0FF, 0x183, 0x7FF]  # each length of an identifier in msgpack
-        with RawBus(where, wanted) as bus, RawBus(where) as python:
+        filters = [0x000, 0x050, 0x0FF, 0x183, 0x7FF]  # each length of an identifier in msgpack
+        with RawBus(where, filters) as bus, RawBus(where) as python:
             function("send_frame")(bus.port, 0x183, 0, 0)
             for cob_id in range(0x800):
                 other.send(can.Message(arbitration_id=cob_id, is_extended_id=False))
                 if cob_id % 256 == 0:
                     other.send(can.Message(arbitration_id=cob_id, is_extended_id=True))
                     other.send(can.Message(arbitration_id=cob_id, is_extended_id=False, is_remote_frame=True))
-            assert receive_all(bus.port) == wanted
+            assert receive_all(bus.port) == filters
             assert len(receive_all(python.port)) == 0x800 + 1
             with pytest.raises(RigError, match="513 frames to receive; at most 512 are possible"):
                 bus.set_filter(range(EXTENDED, EXTENDED + 513))
@@ -485,13 +485,13 @@ class TestFrames:
         with RawBus(where) as bus, RawBus(where, ()) as sender:
             make_buffer_small(bus.descriptors[0])
             outcomes = [send(sender.port, 0x100, 0, 0) for _ in range(3_000)]
-            sent = outcomes.count(SENT)
-            kept = len(receive_all(bus.port))
+            sends = outcomes.count(SENT)
+            arrivals = len(receive_all(bus.port))
             send(sender.port, 0x100, 0, 0)  # the count rides on the next frame
             assert receive(bus.port, soon())[0] == FRAME
-            assert kept + bus.overflows == sent
+            assert arrivals + bus.overflows == sends
             assert bus.overflows > 0
-            assert sent + outcomes.count(QUEUE_FULL) == 3_000
+            assert sends + outcomes.count(QUEUE_FULL) == 3_000
 
 def read_by_python_can(data: bytes) -> tuple[Any, ...]:
     """What `Link` on a `UdpBus` makes of a datagram: COB-ID, length, payload; (-1,) for what is no data frame."""
@@ -529,12 +529,12 @@ class TestDatagrams:
     def test_reads_what_python_can_packs(self, message: can.Message) -> None:
         data = pack_message(message)
         try:
-            expected = read_by_python_can(data)
+            reference = read_by_python_can(data)
         except ValueError:  # its flags or its length contradict each other
-            expected = (-1,)
-        assert read_compiled(data) == expected
-        swapped = dict(sorted(msgpack.unpackb(data).items()))
-        assert read_compiled(msgpack.packb(swapped)) == (-1,)
+            reference = (-1,)
+        assert read_compiled(data) == reference
+        sorted_fields = dict(sorted(msgpack.unpackb(data).items()))
+        assert read_compiled(msgpack.packb(sorted_fields)) == (-1,)
 
     @given(st.integers(0, IDENTIFIER), st.binary(max_size=64), st.sets(st.sampled_from(range(3))))
     def test_packs_as_python_can_does(self, number: int, data: bytes, kinds: set[int]) -> None:
@@ -554,15 +554,15 @@ class TestDatagrams:
         data = pack_message(message)
         place %= len(data)
         data = {"cut": data[:place], "bad": data[:place] + bad + data[place + len(bad):], "more": data + bad}[way]
-        seen = read_compiled(data)
-        assert way == "bad" or seen == (-1,)
-        if seen[0] >= 0:  # a text that is not UTF-8 does not matter to it
+        reading = read_compiled(data)
+        assert way == "bad" or reading == (-1,)
+        if reading[0] >= 0:  # a text that is not UTF-8 does not matter to it
             fields = {key.decode(errors="replace"): value for key, value in msgpack.unpackb(data, raw=True).items()}
             bits = fields.get("data") or b""
             cob_id = fields["arbitration_id"]
             cob_id |= EXTENDED if fields.get("is_extended_id", True) else 0
             cob_id |= FD if fields.get("is_fd") else 0
-            assert seen == (cob_id, len(bits), payload(bits[:8]), bits)
+            assert reading == (cob_id, len(bits), payload(bits[:8]), bits)
             assert fields["dlc"] == len(bits)
             assert not (fields.get("is_remote_frame") or fields.get("is_error_frame"))
 
@@ -580,9 +580,9 @@ def test_everybody_hears_all_frames_in_one_order(where: str) -> None:
 
         with ThreadPoolExecutor(4) as pool:
             list(pool.map(work, range(4)))  # raises what failed in a thread
-        heard = [[receive(bus.port, soon())[2:] for _ in range(1200)] for bus in receivers]
-        assert heard[0] == heard[1] == heard[2]
-        assert {frame[0] for frame in heard[0]} == {0x100, 0x101, 0x102, 0x103}
+        arrivals = [[receive(bus.port, soon())[2:] for _ in range(1200)] for bus in receivers]
+        assert arrivals[0] == arrivals[1] == arrivals[2]
+        assert {frame[0] for frame in arrivals[0]} == {0x100, 0x101, 0x102, 0x103}
 
 
 @pytest.mark.parametrize("where", ["embedded", "virtual:x", "slcan:x"])

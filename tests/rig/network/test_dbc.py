@@ -65,8 +65,8 @@ def test_dbc_and_code_agree(cob_id: int) -> None:
 
 def test_each_frame_has_its_sender_and_receivers_and_the_transmission_types_of_the_interface() -> None:
     assert {pdo.cob_id: pdo.node for pdo in ALL_PDOS if pdo.sends} == SENDERS
-    heard = {cob_id: {pdo.node for pdo in ALL_PDOS if not pdo.sends and pdo.cob_id == cob_id} for cob_id in FRAMES}
-    assert heard == RECEIVERS
+    receivers = {cob_id: {pdo.node for pdo in ALL_PDOS if not pdo.sends and pdo.cob_id == cob_id} for cob_id in FRAMES}
+    assert receivers == RECEIVERS
     kinds = {(pdo.node, pdo.cob_id): pdo.kind for pdo in ALL_PDOS if pdo.node != 1}
     assert kinds == {(2, 0x202): 1, (2, 0x183): 255, (2, 0x182): 255, (3, 0x182): 1, (3, 0x183): 1, (3, 0x283): 1}
 

@@ -54,8 +54,8 @@ class Device:
             self._notify(frame.cob_id, bytearray(frame.data), 0.0)
 
     def tick(self, t_ns: int) -> None:
-        found = self._local.object_dictionary.get(0x1017)
-        period = self._local.sdo[0x1017].raw if found is not None and self._state else 0
+        entry = self._local.object_dictionary.get(0x1017)
+        period = self._local.sdo[0x1017].raw if entry is not None and self._state else 0
         if period and t_ns >= self._due:
             self._due = t_ns + period * 1_000_000
             self._send(0x700 + self._node, bytes((self._state,)))
@@ -125,12 +125,12 @@ def test_a_device_without_heartbeat_is_started_and_not_watched(tmp_path: Path) -
 
 def test_a_fixed_heartbeat_is_watched_by_its_own_period(tmp_path: Path) -> None:
     place = Place(tmp_path, {**OBJECTS, **IDENTITY, **MODES, "1017": Entry(6, "const", "500")})
-    lost: list[Role] = []
-    place.master.hooks.on_lost = lost.append
+    losses: list[Role] = []
+    place.master.hooks.on_lost = losses.append
     place.master.configure(b"", None, 8000)
     place.master.start()
     assert place.master.wait_for_operational(2.0).keys() == {Role.CONTROLLER}
-    assert place.master.find_silent(2.0) == [] and not lost
+    assert place.master.find_silent(2.0) == [] and not losses
 
 
 def test_the_mode_of_a_drive_is_set_and_read_back(tmp_path: Path) -> None:
@@ -142,8 +142,8 @@ def test_the_mode_of_a_drive_is_set_and_read_back(tmp_path: Path) -> None:
         "bench.toml: controller.mode: expected a mode of node 5 controller, not 7: 0x6061 shows 0")
     with pytest.raises(BusError, match="node 5 controller, object 0x6060: Code 0x06090030"):
         Place(tmp_path, refused=0x6060).master.configure(b"", None, 0)
-    mapped = format_eds(ALL, (Mapped((0x2000_0020, 0x6040_0010, 0x6060_0008), "$NODEID+0x200"), RPDOS[1]), TPDOS)
-    place = Place(tmp_path, sheet=mapped)  # a PDO carries it
+    sheet = format_eds(ALL, (Mapped((0x2000_0020, 0x6040_0010, 0x6060_0008), "$NODEID+0x200"), RPDOS[1]), TPDOS)
+    place = Place(tmp_path, sheet=sheet)  # a PDO carries it
     place.master.configure(b"", None, 0)
     assert 0x6060 not in {index for index, _, _ in place.device.writes}
 

@@ -73,9 +73,9 @@ def alone() -> Master:
 def test_bring_up_and_some_cycles(wire: Wire) -> None:
     """Boot-up, scenario, gains, heartbeats, start: what a run begins with; then SYNCs that all nodes answer."""
     master = Master(wire, wire.clock.now, False, load_bench())
-    seen: list[tuple[int, int]] = []
+    node_states: list[tuple[int, int]] = []
     frames: list[int] = []
-    master.hooks.on_state = lambda node, state: seen.append((node, state))
+    master.hooks.on_state = lambda node, state: node_states.append((node, state))
     master.hooks.on_frame = lambda frame: frames.append(frame.cob_id)
     master.reset()
     master.configure(SCENARIO, Model().values, 0)
@@ -90,7 +90,7 @@ def test_bring_up_and_some_cycles(wire: Wire) -> None:
     master.stop()
     assert wire.wait(lambda: set(master.states.values()) == {127}, 60.0)
     for node in (CONTROLLER, PLANT):
-        states = [state for n, state in seen if n == node]
+        states = [state for n, state in node_states if n == node]
         assert 0 in states and states[-2:] == [5, 127]  # a heartbeat may come before the boot-up
     assert master.list_errors() == [] and not master.hears_rival(0.0)
 
