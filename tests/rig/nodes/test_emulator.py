@@ -54,7 +54,7 @@ class BusDesk:
     @contextmanager
     def run(self) -> Iterator[BusDesk]:
         compile_loop()
-        ended = threading.Event()
+        stop = threading.Event()
         ready = threading.Event()
 
         def serve() -> None:
@@ -63,7 +63,7 @@ class BusDesk:
                 link.leave_out(list_unheard(load_bench()))
                 self.node = EmulatorService(link.send, raw, enter_loop_thread, self.scenario)
                 ready.set()
-                serve_node(self.node, link, clock, ended.is_set)
+                serve_node(self.node, link, clock, stop.is_set)
                 self.node.close()
 
         thread = threading.Thread(target=serve)
@@ -75,7 +75,7 @@ class BusDesk:
                 self.restart()
                 yield self
             finally:
-                ended.set()
+                stop.set()
                 thread.join()
 
     def restart(self) -> None:
@@ -95,8 +95,8 @@ class BusDesk:
         while time.monotonic() < end:
             for frame in self.link.poll(0.05):
                 self.heard.append((frame.cob_id, frame.data))
-            for place, (heard, data) in enumerate(self.heard[self._read:]):
-                if heard == cob_id:
+            for place, (identifier, data) in enumerate(self.heard[self._read:]):
+                if identifier == cob_id:
                     self._read += place + 1
                     return data
         raise TimeoutError(f"no frame 0x{cob_id:03X}")
@@ -132,8 +132,8 @@ class BusDesk:
 @pytest.fixture
 def desk(bus_kind: str) -> Iterator[BusDesk]:
     """A started emulator without noise, in lockstep."""
-    with BusDesk(spec(bus_kind), Scenario(QUIET, Plan(stop=0))).run() as started:
-        yield started
+    with BusDesk(spec(bus_kind), Scenario(QUIET, Plan(stop=0))).run() as desk:
+        yield desk
 
 
 QUIET = Model().replace({f"sensors.{what}_noise": 0.0 for what in ("position", "pressure", "spool")})
@@ -222,20 +222,20 @@ class TestServices:
         """The same frames in, the same frames out, also where it hears no SYNC or nothing at all."""
         scenario = Scenario(QUIET, Plan(faults=() if fault is None else (fault,), stop=20))
         script = write_script(text, Schedule(scenario.plan))
-        expected: list[tuple[int, bytes]] = []
-        emulator = Emulator(lambda cob_id, data: expected.append((cob_id, data)), scenario)
+        answers: list[tuple[int, bytes]] = []
+        emulator = Emulator(lambda cob_id, data: answers.append((cob_id, data)), scenario)
         emulator.tick(0)
         for cob_id, data in ((0, b"\x01\x00"), *script):
             emulator.receive(Frame(0, cob_id, data))
         sent_in_cycle = codec.FEEDBACK, codec.VALVE_STATE, 0x083
-        expected = [each for each in expected if each[0] in sent_in_cycle]
+        answers = [each for each in answers if each[0] in sent_in_cycle]
         with BusDesk(spec(bus_kind), scenario).run() as desk:
             for each in script:
                 desk.link.send(*each)
-            for _ in range(sum(cob_id == codec.VALVE_STATE for cob_id, _ in expected)):
+            for _ in range(sum(cob_id == codec.VALVE_STATE for cob_id, _ in answers)):
                 desk.await_frame(codec.VALVE_STATE)
             desk.settle()
-        assert [each for each in desk.heard if each[0] in sent_in_cycle] == expected
+        assert [each for each in desk.heard if each[0] in sent_in_cycle] == answers
 
     @only_udp
     def test_the_loop_ends_with_the_services(self, bus_kind: str) -> None:
@@ -294,30 +294,30 @@ def test_the_answer_to_cycle_k_acts_from_cycle_k_plus_1() -> None:
     assert counters(desk) == (0, 0)
 
 
-@pytest.mark.parametrize(("drives", "flags", "counted", "emergencies", "current"), [
+@pytest.mark.parametrize(("drives", "flags", "counts", "emergencies", "current"), [
     (".-<..", [0, 0, 1, 2, 0], (1, 1), [], 2e-3),  # the current stays
     (".---", [0, 0, 1, 1], (2, 0), [], 2e-3),
     (".---.", [0, 0, 1, 1, 5], (3, 0), [0x8250], 0.0),  # three in a row cut it ..
     (".---..", [0, 0, 1, 1, 5, 0], (3, 0), [0x8250, 0], 2e-3),  # .. and an answer brings it back
     ("<<<<<", [0, 2, 2, 6, 6], (0, 4), [0x8250], 0.0),
 ])
-def test_missing_and_late_drives(drives: str, flags: list[int], counted: tuple[int, int], emergencies: list[int],
+def test_missing_and_late_drives(drives: str, flags: list[int], counts: tuple[int, int], emergencies: list[int],
                                  current: float) -> None:
     """A drive after each SYNC: one that answers it, none (-), or one that answers another cycle (<)."""
     desk = PlantDesk(scenario())
     assert [desk.cycle(None if drive == "-" else 2e-3, answers=60_000 if drive == "<" else None)[1].flags
             for drive in drives] == flags
-    assert (counters(desk), desk.emergencies(), read_reals(desk, ec.IN_FORCE)) == (counted, emergencies, [current])
+    assert (counters(desk), desk.emergencies(), read_reals(desk, ec.IN_FORCE)) == (counts, emergencies, [current])
 
 
-@pytest.mark.parametrize(("fault", "two", "counted"), [
+@pytest.mark.parametrize(("fault", "two", "counts"), [
     (Lost(frame="drive", start=0.003, count=1), [1, 0], (1, 0)),
     (Late(frame="drive", start=0.003, end=0.004, delay=1.5e-3), [1, 2], (1, 1)),
     (Late(frame="drive", start=0.003, end=0.004, delay=0.5e-3), [0, 0], (0, 0))])  # what comes last counts
-def test_lost_and_late_drive_as_the_plan_says(fault: Fault, two: list[int], counted: tuple[int, int]) -> None:
+def test_lost_and_late_drive_as_the_plan_says(fault: Fault, two: list[int], counts: tuple[int, int]) -> None:
     desk = PlantDesk(scenario(fault))
     assert [desk.cycle(1e-3)[1].flags for _ in range(8)] == [0, 0, 0, 0, *two, 0, 0]
-    assert counters(desk) == counted
+    assert counters(desk) == counts
 
 
 def test_feedback_lost_and_late() -> None:
@@ -351,16 +351,16 @@ def test_sensor_faults_show_in_the_frames_only() -> None:
     assert ours == other
 
 
-@pytest.mark.parametrize(("placed", "readings", "expected"), [
+@pytest.mark.parametrize(("faults", "readings", "outputs"), [
     ([Stuck(signal="xj", start=0.003, end=0.006)], range(8), [0, 1, 2, 2, 2, 2, 6, 7]),
     ([Stuck(signal="xj", value=7.0, start=0.0, end=0.001)], [1, 1], [7, 1]),
     ([Offset(signal="xj", value=4.0, start=0.0, end=0.006, ramp=0.004)], [1] * 7, [1, 2, 3, 4, 5, 5, 1]),
     ([Offset(signal="xs", value=4.0, start=0.0)], [1], [1]),
     ([Offset(signal="xj", value=1.0, start=0.0), Stuck(signal="xj", value=9.0, start=0.0)], [0], [9]),  # in this order
 ])
-def test_sensor_faults(placed: list[Fault], readings: list[float], expected: list[float]) -> None:
-    memory = ec.make_memory(scenario(*placed))
-    assert [ec._disturb(memory, 0, float(value), k) for k, value in enumerate(readings)] == expected
+def test_sensor_faults(faults: list[Fault], readings: list[float], outputs: list[float]) -> None:
+    memory = ec.make_memory(scenario(*faults))
+    assert [ec._disturb(memory, 0, float(value), k) for k, value in enumerate(readings)] == outputs
 
 
 def test_noise_has_its_size_and_depends_on_seed_and_cycle_only() -> None:
