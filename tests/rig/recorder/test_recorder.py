@@ -80,11 +80,11 @@ def test_library_reads_a_complete_log(log: Path) -> None:
     assert {c.topic: c.metadata for c in summary.channels.values()}["/signals"]["unit.p12"] == "Pa"
     assert names == {name: data for name, (_, data) in ATTACHMENTS.items()}
     assert metadata == {"run": METADATA, "verdict": {"status": "ABORTED"}}
-    written = [(t, f, s) for t, f, s, _ in build_cycles() if s.cycle < 1300]
+    cycles = [(t, f, s) for t, f, s, _ in build_cycles() if s.cycle < 1300]
     assert [(t, d.cycle, d.xj, d.p12) for topic, t, d in rows if topic == "/signals"] == \
-        [(t, s.cycle, s.xj, s.p12) for t, _, s in written]
+        [(t, s.cycle, s.xj, s.p12) for t, _, s in cycles]
     assert [(t, d.cob_id, d.data) for topic, t, d in rows if topic == "/can"] == \
-        [tuple(f) for _, fs, _ in written for f in fs]
+        [tuple(f) for _, fs, _ in cycles for f in fs]
     assert sum(topic == "/timing" for topic, _, _ in rows) == 1300
 
 
@@ -172,18 +172,18 @@ def test_a_start_that_is_no_date_is_refused(tmp_path: Path, text: str) -> None:
 
 def test_every_cut_gives_a_readable_log_or_a_clear_refusal(log: Path, tmp_path: Path) -> None:
     data = log.read_bytes()
-    kept = []
+    counts = []
     for cut in range(0, len(data), 9001):
         path, out = tmp_path / "cut.mcap", tmp_path / "out.mcap"
         path.write_bytes(data[:cut])
         try:
-            kept.append(recover_log(path, out).messages)
+            counts.append(recover_log(path, out).messages)
         except InputError as error:
             assert cut < 200 and "MCAP log" in str(error)
             continue
         with out.open("rb") as stream:
-            assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == kept[-1]
-    assert kept == sorted(kept) and kept[-1] > 0
+            assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == counts[-1]
+    assert counts == sorted(counts) and counts[-1] > 0
 
 
 def test_damage_in_the_middle_costs_one_chunk(log: Path, tmp_path: Path) -> None:
@@ -246,21 +246,21 @@ def test_foxglove_paths_are_in_the_log(topics: tuple[Fields, Fields]) -> None:
     panels = list_panels(layout["layout"])
     assert len(panels) == len(set(panels)) and set(panels) == set(layout["configById"])
     every, numbers = topics
-    shown = set()
+    panel_topics = set()
     for name, panel in layout["configById"].items():
         if "topicPath" in panel:
             assert panel["topicPath"] in every
-            shown.add(panel["topicPath"])
+            panel_topics.add(panel["topicPath"])
         for path in panel.get("paths", []):
-            found = re.fullmatch(r"(/\w+)(?:\{(\w+)==\d+\})?\.(\w+)(?:\.@mul\(([\d.]+)\))?", path["value"])
-            assert found, path["value"]
-            topic, chosen, field, factor = found.groups()
-            assert field in every[topic] and (chosen is None or chosen in numbers[topic])
-            shown.add(topic)
+            match = re.fullmatch(r"(/\w+)(?:\{(\w+)==\d+\})?\.(\w+)(?:\.@mul\(([\d.]+)\))?", path["value"])
+            assert match, path["value"]
+            topic, filter_field, field, factor = match.groups()
+            assert field in every[topic] and (filter_field is None or filter_field in numbers[topic])
+            panel_topics.add(topic)
             if name.startswith("Plot!"):
                 unit = re.search(r"\[(.*)\]", panel["foxglovePanelTitle"])
                 assert field in numbers[topic] and unit and float(factor or 1.0) == SCALES[unit[1]]
-    assert shown == set(every) - {"/can"}
+    assert panel_topics == set(every) - {"/can"}
 
 
 def test_plotjuggler_curves_are_in_the_log(topics: tuple[Fields, Fields]) -> None:
@@ -294,12 +294,12 @@ def test_raw_frames_there_and_back(log: Path, tmp_path: Path, suffix: str) -> No
     assert [f[1:] for f in before] == [f[1:] for f in after]
     worst = max(abs(a.t_ns - b.t_ns) for a, b in zip(before, after, strict=True))
     assert worst <= 100_000  # .trc counts 0.1 ms
-    want, got = Trace.read(log, all=True), Trace.read(tmp_path / "back.mcap")
+    original, copy = Trace.read(log, all=True), Trace.read(tmp_path / "back.mcap")
     for name, resolution in {"com": 1e-7, "xj": 1e-7, "cor": 1e-8, "p12": 10.0, "xs": 1e-9}.items():
-        np.testing.assert_allclose(got.column(name), want.column(name), atol=0.51 * resolution)
-    assert np.isnan(got.load).all() and not got.gaps
-    assert {*bench.files} <= got.attachments.keys()
-    assert got.provenance["imported"] == out.name
+        np.testing.assert_allclose(copy.column(name), original.column(name), atol=0.51 * resolution)
+    assert np.isnan(copy.load).all() and not copy.gaps
+    assert {*bench.files} <= copy.attachments.keys()
+    assert copy.provenance["imported"] == out.name
 
 
 @pytest.mark.parametrize("suffix", RAW_SUFFIXES)
@@ -318,8 +318,8 @@ def test_every_kind_of_frame_there_and_back(tmp_path: Path, suffix: str) -> None
     assert list(read_raw_frames(tmp_path / "x.mcap")) == frames
     out = tmp_path / f"x{suffix}"
     assert export_trace(tmp_path / "x.mcap", out) == len(frames)
-    heard = list(list_can_messages(out))
-    for frame, (_, message) in zip(frames, heard, strict=True):
+    messages = list(list_can_messages(out))
+    for frame, (_, message) in zip(frames, messages, strict=True):
         if not message.is_fd or frame.data:
             assert message.equals(make_message(*frame[1:]), timestamp_delta=None, check_channel=False)
     import_frames(out, tmp_path / "back.mcap", load_bench())
@@ -373,7 +373,7 @@ CANDUMP = """\
 
 @pytest.mark.parametrize("faster", [1, 4])
 def test_lost_and_late_frames_of_a_candump(faster: int, tmp_path: Path) -> None:
-    text = re.sub(r"\.(\d+)", lambda found: f".{int(found[1]) // faster:06}", CANDUMP)
+    text = re.sub(r"\.(\d+)", lambda match: f".{int(match[1]) // faster:06}", CANDUMP)
     assert import_frames(write_file(tmp_path / "x.log", text), tmp_path / "x.mcap", load_bench()) == 5
     trace = Trace.read(tmp_path / "x.mcap")
     assert trace.period == 1e-3 / faster and len(trace) == 7 and [g.cycles for g in trace.gaps] == [2]
@@ -383,12 +383,12 @@ def test_lost_and_late_frames_of_a_candump(faster: int, tmp_path: Path) -> None:
         (2, "pre-operational"), ("emcy", "node 3: 0x8250"), ("frame", "0x202: 2 bytes")}
 
 
-@pytest.mark.parametrize(("before", "kept"), [("(1700000000.002000)", 3), ("(1700000000.006000)", 4)])
-def test_main_is_the_longest_piece_between_starts_of_the_plant(before: str, kept: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("before", "cycles"), [("(1700000000.002000)", 3), ("(1700000000.006000)", 4)])
+def test_main_is_the_longest_piece_between_starts_of_the_plant(before: str, cycles: int, tmp_path: Path) -> None:
     """A run resets it after its probes: a replay across the reset would find fault with the model."""
     assert import_frames(
         write_file(tmp_path / "x.log", CANDUMP.replace(before, f"(1700000000.001900) can0 703#00\n{before}", 1)),
-        tmp_path / "x.mcap", load_bench()) == kept
+        tmp_path / "x.mcap", load_bench()) == cycles
 
 
 def test_csv_becomes_a_log(log: Path, tmp_path: Path) -> None:
