@@ -78,9 +78,9 @@ def test_from_a_plant_file_to_its_hidden_fault(where: str, here: Path, monkeypat
     """One Python file and one bench file, five measured signals: check, run, explain, run --from."""
     write_bench(here)
     Path("stiff.toml").write_text('plant = "trim_jack.py"\neffects = ["tight_seal"]\n[tight_seal]\ntorque = 0.02\n')
-    checked = rig("check", "preflight", "--bench", "trim.toml", "--trust", "--json").json
-    carried = {signal for each in checked["bench"]["frames"] for signal in each["signals"]}
-    assert checked["verdict"] == "WITHIN_LIMITS" and {"trim_cmd", "trim_angle", "torque_ref"} <= carried
+    report = rig("check", "preflight", "--bench", "trim.toml", "--trust", "--json").json
+    bus_signals = {signal for each in report["bench"]["frames"] for signal in each["signals"]}
+    assert report["verdict"] == "WITHIN_LIMITS" and {"trim_cmd", "trim_angle", "torque_ref"} <= bus_signals
     run = play(here / "hidden", "--bench", "trim.toml", "--model", "stiff.toml", "--trust")
     assert run.status == 0, run
     assert {"shaft_rate", "phase_amps", "rotor_angle", "case_rise"} <= {*Trace.read(here / "hidden").signals}
@@ -88,8 +88,8 @@ def test_from_a_plant_file_to_its_hidden_fault(where: str, here: Path, monkeypat
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
     assert "--trust, because it brings code along" in refuse("compare", here / "hidden")
-    explained = rig("explain", here / "hidden", "--trust", "--json").json
-    assert (explained["verdict"], explained["effects"]) == ("EXPLAINED", ["tight_seal"])
+    explanation = rig("explain", here / "hidden", "--trust", "--json").json
+    assert (explanation["verdict"], explanation["effects"]) == ("EXPLAINED", ["tight_seal"])
     with run_device(DRIVE, where, *PATIENT[DRIVE]):
         again = rig("run", "--from", here / "hidden", "--trust", "--bus", where, "--out", elsewhere / "again")
     assert again.status == 0, again
@@ -105,8 +105,8 @@ def test_a_plant_without_a_device_runs_with_its_own_controller(here: Path) -> No
     result = rig("run", "--model", "motor.py", "--set", "dry_friction.torque=0.3", "--json", "--out", "run")
     assert (result.status, result.json["verdict"]) == (0, "PASS"), result
     assert Trace.read("run").period == 2e-3
-    skipped = {each["name"] for each in result.json["not_applicable"]}
-    assert "same answers after a reset" in skipped  # and so not counted as passed
+    skipped_checks = {each["name"] for each in result.json["not_applicable"]}
+    assert "same answers after a reset" in skipped_checks  # and so not counted as passed
     again = rig("run", "--from", "run", "--trust", "--out", "again")
     assert again.status == 0, again
     assert rig("diff", "run", "again", "--json").json["verdict"] == "SAME"

@@ -68,14 +68,14 @@ class Script:
             getattr(self, name)(*arguments)
         return self
 
-    def attribute(self, gone: Mapping[Role, str] | None = None, policy: TimingPolicy = POLICY) -> Attribution:
+    def attribute(self, gone_nodes: Mapping[Role, str] | None = None, policy: TimingPolicy = POLICY) -> Attribution:
         due = np.arange(N, dtype=np.int64) * MS
         records = CycleRecords(due, self.lateness, self.feedback, self.valve, self.response, self.flags,
                                Injected(*self.injected), self.delay)
-        return attribute(records, self.troubles, policy, load_bench(), gone or {})
+        return attribute(records, self.troubles, policy, load_bench(), gone_nodes or {})
 
 
-@pytest.mark.parametrize(("controller", "plant", "blamed"), [
+@pytest.mark.parametrize(("controller", "plant", "blame"), [
     (StartTime(0.02), StartTime(0.01), None), (StartTime(1.0), StartTime(0.99), None),
     (StartTime(1.5), StartTime(0.01), (CONTROLLER, "bring_up")), (None, StartTime(0.01), (CONTROLLER, "bring_up")),
     (StartTime(1.5, 0.2), StartTime(0.01), (CONTROLLER, "bring_up")),  # the rig stood still, but not that long
@@ -84,15 +84,15 @@ class Script:
     (StartTime(0.02), StartTime(1.4), (PLANT, "late")), (StartTime(0.02), None, (PLANT, "bring_up")),
 ])
 def test_who_is_to_blame_for_a_slow_start(controller: StartTime | None, plant: StartTime | None,
-                                          blamed: tuple[int, str] | None) -> None:
+                                          blame: tuple[int, str] | None) -> None:
     times = {node: time for node, time in ((CONTROLLER, controller), (PLANT, plant)) if time is not None}
-    found = find_start_problem(times, 1.0, NAMES)
-    assert (None if found is None else (found[2], found[0])) == blamed
-    if found is not None and found[0] == "late":
+    problem = find_start_problem(times, 1.0, NAMES)
+    assert (None if problem is None else (problem[2], problem[0])) == blame
+    if problem is not None and problem[0] == "late":
         script = Script()
-        script.report(0, found[2], 0, *found[:2])
+        script.report(0, problem[2], 0, *problem[:2])
         cause = script.attribute().cause
-        assert cause is not None and cause.is_lateness and cause.text == found[1]
+        assert cause is not None and cause.is_lateness and cause.text == problem[1]
 
 
 KILLED = "its process was ended by SIGKILL"
@@ -161,15 +161,17 @@ CASES: dict[str, tuple[list[tuple[Any, ...]], dict[int, str], tuple[int, str, in
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_first_cause(case: str) -> None:
-    steps, gone, expected, words = CASES[case]
+    steps, gone_nodes, cause, words = CASES[case]
     script = Script().spoil(steps)
-    found = script.attribute(gone)
-    assert found.cause is not None and (found.cause.source, found.cause.kind, found.cause.cycle) == expected
-    assert words in found.cause.text and found.cause.is_gone is (found.cause.source in gone)
-    own = sum(trouble.text == found.cause.text for trouble in script.troubles)
-    assert len(found.consequences) == len(script.troubles) - own and found.by_bench >= found.cause.is_lateness
-    if (found.cause.source, found.cause.kind) == (CONTROLLER, "stopped"):
-        assert "SYNC was sent at most 0.02 ms late and feedback came within 0.10 ms" in found.cause.evidence[0]
+    attribution = script.attribute(gone_nodes)
+    assert attribution.cause is not None and cause == (
+        attribution.cause.source, attribution.cause.kind, attribution.cause.cycle)
+    assert words in attribution.cause.text and attribution.cause.is_gone is (attribution.cause.source in gone_nodes)
+    own_troubles = sum(trouble.text == attribution.cause.text for trouble in script.troubles)
+    assert (len(attribution.consequences) == len(script.troubles) - own_troubles
+            and attribution.by_bench >= attribution.cause.is_lateness)
+    if (attribution.cause.source, attribution.cause.kind) == (CONTROLLER, "stopped"):
+        assert "SYNC was sent at most 0.02 ms late and feedback came within 0.10 ms" in attribution.cause.evidence[0]
 
 
 @pytest.mark.parametrize(("steps", "unjudged", "affected", "invalid", "overruns"), [
@@ -183,10 +185,11 @@ def test_the_first_cause(case: str) -> None:
 ])
 def test_what_lateness_spoils(steps: list[tuple[Any, ...]], unjudged: Collection[int], affected: Collection[int],
                               invalid: dict[str, int], overruns: dict[int, int]) -> None:
-    found = Script().spoil(steps).attribute()
-    assert [set(np.flatnonzero(rows)) for rows in (~found.judged, found.affected)] == [set(unjudged), set(affected)]
-    assert invalid.items() <= found.invalid.items()
-    assert {int(k): int(found.overruns[k]) for k in np.flatnonzero(found.overruns)} == overruns
+    attribution = Script().spoil(steps).attribute()
+    assert [set(np.flatnonzero(rows)) for rows in (~attribution.judged, attribution.affected)] == [
+        set(unjudged), set(affected)]
+    assert invalid.items() <= attribution.invalid.items()
+    assert {int(k): int(attribution.overruns[k]) for k in np.flatnonzero(attribution.overruns)} == overruns
 
 
 def test_the_limits_are_those_of_the_sequence_and_a_plant_that_is_dead_is_not_late() -> None:
@@ -207,18 +210,19 @@ def test_a_run_without_cycles() -> None:
     empty, mask = np.zeros(0), np.zeros(0, dtype=bool)
     records = CycleRecords(np.zeros(0, dtype=np.int64), empty, empty, empty, empty, np.zeros(0, dtype=np.int64),
                            Injected(mask, mask, mask), empty)
-    found = attribute(records, [Trouble(0, CONTROLLER, "bring_up", 0, "slow")], POLICY, load_bench(), {PLANT: "gone"})
-    assert found.cause is not None and found.cause.source == CONTROLLER and len(found.judged) == 0
+    attribution = attribute(records, [Trouble(0, CONTROLLER, "bring_up", 0, "slow")], POLICY, load_bench(),
+                            {PLANT: "gone"})
+    assert attribution.cause is not None and attribution.cause.source == CONTROLLER and len(attribution.judged) == 0
 
 
-@pytest.mark.parametrize(("fault", "expected"), [
+@pytest.mark.parametrize(("fault", "cycles"), [
     (Lost(frame="drive", start=0.1, count=3), (set(), set(), {*range(100, 106)})),
     (Lost(frame="feedback", start=0.1, count=1), (set(), {100}, {*range(100, 104)})),
     (Late(frame="feedback", start=0.1, count=1, delay=1.5e-3), (set(), {100, 101, 102}, {*range(100, 106)})),
     (Silent(node="rig", start=0.1, end=0.2), (set(), set(), {*range(100, 600)})),
     (Offset(signal="xj", start=0.1, value=1e-3), (set(), set(), set())),
 ])
-def test_cycles_that_faults_disturb(fault: Fault, expected: tuple[set[int], ...]) -> None:
+def test_cycles_that_faults_disturb(fault: Fault, cycles: tuple[set[int], ...]) -> None:
     plan = Plan(faults=(fault,), stop=900)
-    found: Any = find_injected(plan, Schedule(plan), 900)
-    assert tuple(set(np.flatnonzero(mask).tolist()) for mask in found) == expected
+    masks: Any = find_injected(plan, Schedule(plan), 900)
+    assert tuple(set(np.flatnonzero(mask).tolist()) for mask in masks) == cycles

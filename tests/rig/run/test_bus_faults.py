@@ -15,8 +15,8 @@ SAFE = SHORT + 'ends = "safe_state"\n'
 
 
 def play_fault(folder: Path, *faults: str, text: str = SHORT, **settings: object) -> Outcome:
-    listed = ", ".join("{ " + fault + " }" for fault in faults)
-    return play(job(f"faults = [{listed}]\n{text}", seed=1, **settings), folder)  # type: ignore[arg-type]
+    fault_list = ", ".join("{ " + fault + " }" for fault in faults)
+    return play(job(f"faults = [{fault_list}]\n{text}", seed=1, **settings), folder)  # type: ignore[arg-type]
 
 
 def read_frames(folder: Path) -> list[tuple[int, bytes]]:
@@ -64,10 +64,10 @@ def test_what_must_not_change_a_run(sound: Path, tmp_path: Path, fault: str) -> 
 def test_what_a_node_must_report(tmp_path: Path, fault: str, node: str, code: str) -> None:
     """Then the rig goes to its safe state; clean-up has current again."""
     outcome = play_fault(tmp_path, fault, text=SAFE)
-    reported = emergencies(outcome)
-    received = [text for text in reported if text.startswith(f"{node} {code}")]
+    reports = emergencies(outcome)
+    matches = [text for text in reports if text.startswith(f"{node} {code}")]
     deaf = '"bus_off", node = "rig"' in fault  # the rig did not hear it
-    assert outcome.safe and (received or deaf), reported
+    assert outcome.safe and (matches or deaf), reports
     trace = Trace.read(tmp_path, all=True)
     assert np.isfinite(trace.xj[trace.phase == CLEANUP]).all()
     assert trace.com[trace.phase == MAIN].size == 350

@@ -42,8 +42,8 @@ def test_the_preflight_is_predicted_at_any_cycle(cycle: str, tmp_path: Path) -> 
     same = [column[::round(len(fine.t) / len(coarse.t))] for column in (fine.com, fine.xj)]
     np.testing.assert_allclose(coarse.com, same[0], rtol=1e-9, atol=1e-12)
     assert float(np.sqrt(np.mean((coarse.xj - same[1]) ** 2))) < 0.1e-3 * max(1.0, float(cycle))
-    for found, expected in zip(dry.checks, usual.checks, strict=True):
-        assert (found.t0, found.t1, found.detail) == (expected.t0, expected.t1, expected.detail)
+    for check, usual_check in zip(dry.checks, usual.checks, strict=True):
+        assert (check.t0, check.t1, check.detail) == (usual_check.t0, usual_check.t1, usual_check.detail)
     values = {check.name: (check.value, usual_check.value)
               for check, usual_check in zip(dry.checks, usual.checks, strict=True)}
     for name, spread in (("gain, 1 Hz", 0.03), ("phase lag, 1 Hz", 1.0), ("rise time, 5 mm", 4.0 * float(cycle))):
@@ -113,6 +113,6 @@ def test_the_period_of_the_model_is_the_cycle_of_the_bench(tmp_path: Path) -> No
     assert "expected 0.001 s, the cycle of 'EHA controller'" in refuse("run", "--set", "controller.period=0.002")
     assert "expected 0.002 s, the cycle of" in refuse("run", "--set", "controller.period=0.005", "--bench", bench)
     for changes in ({}, {"controller.period": 2e-3}):
-        built = build_job(JobChoice(changes=changes, bench=bench))
-        assert built.model["controller.period"] == 2e-3 and built.sequence.rate == 500.0
+        job = build_job(JobChoice(changes=changes, bench=bench))
+        assert job.model["controller.period"] == 2e-3 and job.sequence.rate == 500.0
     assert build_job(JobChoice(), PREFLIGHT.at_rate(500.0)).sequence == PREFLIGHT

@@ -30,7 +30,7 @@ def read_log(folder: Path) -> list[tuple[int, int, bytes]]:
 
 
 @pytest.fixture
-def played(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def cycle_counts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many cycles were played together, call by call."""
     counts: list[int] = []
     original = EmbeddedLoop.play_many
@@ -43,11 +43,11 @@ def played(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
-def play_both(monkeypatch: pytest.MonkeyPatch, folder: Path, *given: Any, **settings: Any) -> Outcome:
+def play_both(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: Any, **settings: Any) -> Outcome:
     """Play a job as it is and with every cycle in Python; the logs and verdicts must be the same."""
-    together = play(job(*given, **settings), folder / "together")
+    together = play(job(*arguments, **settings), folder / "together")
     monkeypatch.setattr(bring_up, "can_play_many", lambda master, bench: False)
-    alone = play(job(*given, **settings), folder / "alone")
+    alone = play(job(*arguments, **settings), folder / "alone")
     assert read_log(folder / "together") == read_log(folder / "alone")
     assert (together.verdict, together.aborted, together.checks) == (alone.verdict, alone.aborted, alone.checks)
     assert together.events == alone.events
@@ -75,13 +75,13 @@ def play_both(monkeypatch: pytest.MonkeyPatch, folder: Path, *given: Any, **sett
     (with_fault('kind = "reset", start = 0.15'), {}, 100),
     (with_fault('kind = "lost", frame = "drive", start = 0.2, count = 1'), {}, 100),
     (GUARDED % 3, {}, 20), (GUARDED % 1, {}, 20), (GUARDED % 40, {}, 20)])
-def test_the_log_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, played: list[int], text: str,
+def test_the_log_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cycle_counts: list[int], text: str,
                              set_: dict[str, float], least: int) -> None:
     play_both(monkeypatch, tmp_path, text, seed=3, set_=set_)
-    assert sum(played) >= least and (least or not sum(played))
+    assert sum(cycle_counts) >= least and (least or not sum(cycle_counts))
 
 
-def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, played: list[int]) -> None:
+def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cycle_counts: list[int]) -> None:
     """No exception and no number that is made up, in either loop: EMCY, and clean-up without current."""
     original = emulator_cycle.fill_noise
 
@@ -94,4 +94,4 @@ def test_a_plant_that_diverges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert (outcome.verdict, outcome.safe) == ("ABORTED", True) and "node 3 plant 0x6000" in outcome.aborted
     trace = Trace.read(tmp_path / "alone", all=True)
     assert np.isnan(trace.xj[200:]).all() and not np.nan_to_num(trace.cor[-50:]).any()
-    assert sum(played) > 150
+    assert sum(cycle_counts) > 150

@@ -179,15 +179,15 @@ def require_same_columns_from_a_capture(folder: Path, bench: Bench, trace: Trace
     """`rig import --bench`: the frames of the run alone, as another tool would have captured them, give its columns."""
     export_trace(folder / "run" / "trace.mcap", folder / "capture.log")
     import_frames(folder / "capture.log", folder / "capture.mcap", bench)
-    found = Trace.read(folder / "capture.mcap", all=True)
-    starts = range(len(found.xj) - len(trace.xj) + 1)  # the capture has the cycles before and after the run too
-    begin = [k for k in starts if np.allclose(found.xj[k:k + len(trace.xj)], trace.xj, rtol=0.0, atol=1e-9)]
+    capture = Trace.read(folder / "capture.mcap", all=True)
+    starts = range(len(capture.xj) - len(trace.xj) + 1)  # the capture has the cycles before and after the run too
+    begin = [k for k in starts if np.allclose(capture.xj[k:k + len(trace.xj)], trace.xj, rtol=0.0, atol=1e-9)]
     assert len(begin) == 1
     rows = slice(begin[0], begin[0] + len(trace.xj))
-    np.testing.assert_allclose(found.com[rows], trace.com, rtol=0.0, atol=1e-9)
-    answered = ~np.isnan(found.cor[rows])  # the run keeps the last current, a capture has what came
-    assert answered.mean() > 0.49
-    np.testing.assert_allclose(found.cor[rows][answered], trace.cor[answered], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(capture.com[rows], trace.com, rtol=0.0, atol=1e-9)
+    is_answered = ~np.isnan(capture.cor[rows])  # the run keeps the last current, a capture has what came
+    assert is_answered.mean() > 0.49
+    np.testing.assert_allclose(capture.cor[rows][is_answered], trace.cor[is_answered], rtol=0.0, atol=1e-9)
 
 
 class Mute(CanDevice):
@@ -198,11 +198,11 @@ class Mute(CanDevice):
         self._left, self._length = answers, length
 
     def take(self, message: can.Message) -> list[can.Message]:
-        found = super().take(message)
-        self._left -= len(found)
-        return found if self._left >= 0 else [
+        answers = super().take(message)
+        self._left -= len(answers)
+        return answers if self._left >= 0 else [
             can.Message(arbitration_id=each.arbitration_id, data=each.data[:self._length])
-            for each in found if self._length]
+            for each in answers if self._length]
 
 
 @only_udp
@@ -227,18 +227,18 @@ class Forgetful(CanopenDevice):
     """It keeps a part of its current over a reset: what it has answered so far counts on."""
 
     def take(self, message: can.Message) -> list[can.Message]:
-        found = super().take(message)
-        self._kept = getattr(self, "_kept", 0.0) + 1e-4 * bool(found)
+        answers = super().take(message)
+        self._kept = getattr(self, "_kept", 0.0) + 1e-4 * bool(answers)
         self._output = (*self._output[:2], 1e-6 / (1.0 + self._kept))
-        return found
+        return answers
 
 
 @only_udp
-@pytest.mark.parametrize(("device", "failed"), [(CanopenDevice, []), (Forgetful, ["same answers after a reset"])])
-def test_a_controller_that_remembers_over_a_reset_fails(device: type[CanopenDevice], failed: list[str], where: str,
+@pytest.mark.parametrize(("device", "failures"), [(CanopenDevice, []), (Forgetful, ["same answers after a reset"])])
+def test_a_controller_that_remembers_over_a_reset_fails(device: type[CanopenDevice], failures: list[str], where: str,
                                                         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The probes are played by the roles of the frames, on a bench without control word and without phases."""
     monkeypatch.setitem(globals(), "CanopenDevice", device)
     _, outcome = play(tmp_path, where, start_synchronous(tmp_path, where))
-    assert [check.name for check in outcome.checks if not check.passed] == failed
+    assert [check.name for check in outcome.checks if not check.passed] == failures
     assert "delay of the answer to a step" in [check.name for check in outcome.checks]

@@ -130,16 +130,16 @@ class Bench(CycleBook):
     def demands(self) -> list[int]:
         return [round(row.com * 1e7) for row in self.rows]
 
-    def check_demands(self, expected: list[int], idle: Collection[int] = ()) -> None:
+    def check_demands(self, demand_order: list[int], idle: Collection[int] = ()) -> None:
         """These demands in this order, in consecutive cycles. A demand that is not one of `idle` stays for longer only
         because this program had not queued the next one in time, and each such cycle is an underrun.
         """
         demands = self.demands()
-        assert [demand for demand, _ in groupby(demands)] == expected
+        assert [demand for demand, _ in groupby(demands)] == demand_order
         assert [row.cycle for row in self.rows] == list(range(len(demands)))
-        repeated = [k for k in range(1, len(demands)) if demands[k] == demands[k - 1] and demands[k] not in idle]
-        assert self.loop.underruns == len(repeated) <= self.loop.overruns
-        assert all(self.timings[k].overrun for k in repeated)
+        repeats = [k for k in range(1, len(demands)) if demands[k] == demands[k - 1] and demands[k] not in idle]
+        assert self.loop.underruns == len(repeats) <= self.loop.overruns
+        assert all(self.timings[k].overrun for k in repeats)
 
 
 @contextmanager
@@ -160,7 +160,7 @@ def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
     Every frame reaches the log once and in order: those of the cycle, and those that the services send and receive on
     their own socket. Nothing is compiled once the loop is made.
     """
-    with (bench(bus_kind, realtime) as one, install_recorder("numba:compiler_lock") as compiled,
+    with (bench(bus_kind, realtime) as one, install_recorder("numba:compiler_lock") as compilations,
           closing(Link(open_can(one.where), time.monotonic_ns)) as other):
         one.master._beat.configure(1, one.wire.clock.now())
         for k in range(30):
@@ -179,7 +179,7 @@ def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
         one.wire.poll(0.0)
         one.loop.close()
         one.settle()
-        assert compiled.buffer == []
+        assert compilations.buffer == []
         one.check_demands(list(range(30)), idle=[29])
         assert realtime or all(later - earlier == PERIOD for earlier, later in pairwise(one.times))
         assert realtime or len(whole()) == len(one.logged(codec.DRIVE)) == 30
@@ -202,7 +202,7 @@ def test_rows_and_log(bus_kind: str, realtime: bool) -> None:
         assert drives == [codec.pack_drive(k * 1e-8, 15, k) for k in range(len(drives))]
         compile_cycle.cache_clear()
         compile_cycle()
-        assert compiled.buffer  # the listener hears
+        assert compilations.buffer  # the listener hears
 
 
 @only_udp
@@ -245,16 +245,16 @@ def test_commands_and_syncs_changed_by_faults(bus_kind: str) -> None:
         one.settle()
         one.check_demands(list(range(16)))
         more = len(one.rows) - 16  # the last demand again, while this program stood still
-        heard = [frame for frame in one.nodes.heard if frame.cob_id in (codec.SYNC, codec.COMMAND)]
-        assert sum(frame.cob_id == codec.SYNC for frame in heard) == 16 - 1 + 1 - 2 + more
-        commands = [frame.data for frame in heard if frame.cob_id == codec.COMMAND]
+        frames = [frame for frame in one.nodes.heard if frame.cob_id in (codec.SYNC, codec.COMMAND)]
+        assert sum(frame.cob_id == codec.SYNC for frame in frames) == 16 - 1 + 1 - 2 + more
+        commands = [frame.data for frame in frames if frame.cob_id == codec.COMMAND]
         plain = [codec.pack_command(min(k, 15) * 1e-7, 7, k) for k in range(16 + more)]
-        inverted = bytes(255 - byte for byte in plain[6])
-        assert commands == [*plain[:6], inverted, plain[7][:3], plain[8], *plain[8:10], *plain[12:]]
+        inverse = bytes(255 - byte for byte in plain[6])
+        assert commands == [*plain[:6], inverse, plain[7][:3], plain[8], *plain[8:10], *plain[12:]]
         for cycle, syncs in ((2, 2), (10, 10), (11, 10)):  # no SYNC in this cycle, so many before
-            answered = {round(row.xj * 1e6) for row in one.rows[:cycle] if not isnan(row.xj)}
+            replies = {round(row.xj * 1e6) for row in one.rows[:cycle] if not isnan(row.xj)}
             xj = one.rows[cycle].xj
-            late = not isnan(xj) and syncs - 1 not in answered and round(xj * 1e6) in set(range(syncs)) - answered
+            late = not isnan(xj) and syncs - 1 not in replies and round(xj * 1e6) in set(range(syncs)) - replies
             assert isnan(xj) or late
 
 
@@ -282,15 +282,15 @@ def test_waiting_for_the_end_of_the_queue_is_no_underrun(bus_kind: str) -> None:
         underruns, k = one.loop.underruns, one.loop.k
         one.play_until(lambda: one.loop.k >= k + 3)
         assert one.loop.hold(2) == pytest.approx(59e-7)
-        held = one.loop.k
-        one.play_until(lambda: one.loop.k >= held + 3)
+        hold_cycle = one.loop.k
+        one.play_until(lambda: one.loop.k >= hold_cycle + 3)
         assert one.loop.underruns == underruns
         one.play(30, phase=2)
         one.loop.finish()
         one.check_demands([*range(60), 30], idle=[59])
         phases = [row.phase for row in one.rows]
         assert phases == sorted(phases) and set(phases) == {1, 2}
-        assert set(phases[:60]) == {1} and set(phases[held:]) == {2}
+        assert set(phases[:60]) == {1} and set(phases[hold_cycle:]) == {2}
 
 
 @only_udp
@@ -304,11 +304,11 @@ def test_the_control_word_is_overridden_and_hold_discards_what_is_queued(bus_kin
         after = one.loop.k
         one.play_until(lambda: one.loop.k >= after + 3)
         demand = round(one.loop.hold(2) * 1e7)
-        held = one.loop.k
+        hold_cycle = one.loop.k
         one.play(1000, phase=2, control=3)
         one.loop.finish()
         one.check_demands([*range(demand + 1), 1000], idle=[demand])
-        assert {row.phase for row in one.rows[:demand]} == {1} and {row.phase for row in one.rows[held:]} == {2}
+        assert {row.phase for row in one.rows[:demand]} == {1} and {row.phase for row in one.rows[hold_cycle:]} == {2}
         words = [row.control for row in one.rows]
         assert [word for word, _ in groupby(words)] == [7, 0, 3] and before <= words.index(0) <= after + 1
         assert one.demands()[words.index(3)] == 1000

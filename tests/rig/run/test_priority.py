@@ -43,12 +43,12 @@ def test_all_threads_are_raised_and_lowered() -> None:
 @contextlib.contextmanager
 def run_loop(from_last: int = 2) -> Iterator[tuple[threading.Thread, list[int]]]:
     """A thread that is in `enter_loop_thread` until the end, and the CPUs that it may use."""
-    seen: list[int] = []
+    loop_cpus: list[int] = []
     entered, done = threading.Event(), threading.Event()
 
     def run() -> None:
         with enter_loop_thread(from_last):
-            seen.extend(list_cpus())
+            loop_cpus.extend(list_cpus())
             entered.set()
             done.wait()
 
@@ -56,7 +56,7 @@ def run_loop(from_last: int = 2) -> Iterator[tuple[threading.Thread, list[int]]]
     loop.start()
     try:
         assert entered.wait(120)
-        yield loop, seen
+        yield loop, loop_cpus
     finally:
         done.set()
         loop.join()
@@ -72,8 +72,8 @@ def test_a_loop_that_runs_already_keeps_its_priority() -> None:
 @pytest.mark.parametrize("from_last", [1, 2])
 def test_the_thread_of_a_loop_has_a_cpu_for_itself(from_last: int) -> None:
     cpus = list_cpus()
-    with run_loop(from_last) as (_, seen):
-        assert seen == [cpus[-from_last]] and list_cpus() == [cpu for cpu in cpus if cpu not in seen]
+    with run_loop(from_last) as (_, loop_cpus):
+        assert loop_cpus == [cpus[-from_last]] and list_cpus() == [cpu for cpu in cpus if cpu not in loop_cpus]
     assert list_cpus() == cpus
 
 

@@ -48,14 +48,14 @@ def test_a_node_that_was_reset_is_watched_as_before(tmp_path: Path) -> None:
     outcome = play_sequence("reset_in_mid_run", tmp_path, set_={"controller.current_limit": 7e-3})
     log = open_log(tmp_path / "trace.mcap")
     frames = [(message.cob_id, message.data) for _, _, message in log.read_messages("/can")]
-    booted = max(k for k, frame in enumerate(frames) if frame == (0x702, b"\0"))
-    started = next(k for k in range(booted, len(frames)) if frames[k] == (0x000, b"\x01\x02"))
-    written = {data[1:4]: data for cob_id, data in frames[booted:started] if cob_id == 0x602 and data[0] >> 5 == 1}
-    first = {data[1:4]: data for cob_id, data in frames[:booted] if cob_id == 0x602 and data[0] >> 5 == 1}
-    indexes = {int.from_bytes(key[:2], "little") for key in written}
+    boot = max(k for k, frame in enumerate(frames) if frame == (0x702, b"\0"))
+    start = next(k for k in range(boot, len(frames)) if frames[k] == (0x000, b"\x01\x02"))
+    writes = {data[1:4]: data for cob_id, data in frames[boot:start] if cob_id == 0x602 and data[0] >> 5 == 1}
+    first_writes = {data[1:4]: data for cob_id, data in frames[:boot] if cob_id == 0x602 and data[0] >> 5 == 1}
+    indexes = {int.from_bytes(key[:2], "little") for key in writes}
     assert indexes == {0x1006, 0x1016, 0x1017, GAINS}
-    assert all(first[key] == data for key, data in written.items() if key[:2] != b"\x17\x10")
-    assert written[b"\x17\x10\0"][4:6] == (100).to_bytes(2, "little")
+    assert all(first_writes[key] == data for key, data in writes.items() if key[:2] != b"\x17\x10")
+    assert writes[b"\x17\x10\0"][4:6] == (100).to_bytes(2, "little")
     assert outcome.verdict == "PASS"
 
 
@@ -71,7 +71,7 @@ class StaysOn(Variant):
         return drive._replace(current=self._current)
 
 
-@pytest.mark.parametrize(("name", "patched", "value", "failed"), [
+@pytest.mark.parametrize(("name", "target", "value", "failures"), [
     ("lost_command", (firmware, "LOST_AFTER"), 10**9, {"reaction", "emergency"}),
     ("lost_feedback", (firmware, "LOST_AFTER"), 10**9, {"reaction", "emergency"}),
     ("lost_sync", (participants, "Firmware"), NoSyncWatch, {"reaction", "emergency"}),
@@ -79,7 +79,7 @@ class StaysOn(Variant):
     ("lost_command", (participants, "Firmware"), StaysOn, {"reaction"}),  # a status word alone is no reaction
     ("lost_feedback", (participants, "Firmware"), StaysOn, {"reaction"})])
 def test_a_controller_that_does_not_react_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
-                                                patched: tuple[object, str], value: object, failed: set[str]) -> None:
-    monkeypatch.setattr(*patched, value)
+                                                target: tuple[object, str], value: object, failures: set[str]) -> None:
+    monkeypatch.setattr(*target, value)
     outcome = play_sequence(name, tmp_path)
-    assert outcome.verdict == "FAIL" and failed <= {check.name for check in outcome.checks if not check.passed}
+    assert outcome.verdict == "FAIL" and failures <= {check.name for check in outcome.checks if not check.passed}

@@ -165,15 +165,16 @@ def test_compiled_cycles_in_lockstep_are_those_in_python(bus_with_nodes: str, na
     preflight are compared in test_c_run.py, on a CAN interface in test_vcan_guest.py.
     """
     text = TEXTS[name]
-    here = play(job(text, seed=3), tmp_path / "a")
-    there = play(job(text, seed=3, bus=bus_with_nodes, controller="external", plant="external"), tmp_path / "b")
-    assert there.timing["kind"] == "lockstep" and (there.verdict, there.aborted) == (here.verdict, here.aborted)
+    local_run = play(job(text, seed=3), tmp_path / "a")
+    external_run = play(job(text, seed=3, bus=bus_with_nodes, controller="external", plant="external"), tmp_path / "b")
+    assert external_run.timing["kind"] == "lockstep" and (
+        external_run.verdict, external_run.aborted) == (local_run.verdict, local_run.aborted)
     fields = ("cycle", "phase", "com", "xj", "cor", "p12", "xs", "load", "control", "status", "flags")
     rows = [table(tmp_path / folder, fields) for folder in "ab"]
     assert rows[0] == rows[1] and len(rows[0]) >= 150
     kinds = {"phase", "section", "fault", "guard", "emcy", "safe_state", "abort", "recovered"}
     events = [[(event.t, event.kind, event.text) for event in one.events if event.kind in kinds and event.t >= 0
-               and "(after the run)" not in event.text] for one in (here, there)]
+               and "(after the run)" not in event.text] for one in (local_run, external_run)]
     # That a short drive frame is whole again is said by the services of the plant, perhaps a cycle later.
     assert events[0] == events[1] or name == "corrupted"
 
@@ -200,9 +201,9 @@ def test_the_compiled_cycle_in_real_time_gives_the_same_signals(bus_kind: str, t
         outcome = play(job(seed=1, bus=spec(bus_kind), pace="realtime", max_overruns=1.0), folder)
         assert outcome.timing["kind"] == "hard real time"
         rows, flags = read_signals(folder), open_log(folder / "trace.mcap").read_columns("/signals")["flags"]
-        shared = min(rows.shape[1], 400)  # set-up and main; a hold may come before clean-up
-        bad = np.flatnonzero(np.isnan(rows[:, :shared]).any(axis=0) | (flags[:shared] != 0))
-        sound = int(bad[0]) if len(bad) else shared
+        cycles = min(rows.shape[1], 400)  # set-up and main; a hold may come before clean-up
+        bad = np.flatnonzero(np.isnan(rows[:, :cycles]).any(axis=0) | (flags[:cycles] != 0))
+        sound = int(bad[0]) if len(bad) else cycles
         assert np.array_equal(rows[:, :sound], reference[:, :sound])
         if sound == 400 and not outcome.timing["underruns"]:
             return
@@ -216,16 +217,16 @@ def test_a_rig_does_not_disturb_another(tmp_path: Path) -> None:
         with (closing(Link(open_can(where), time.monotonic_ns)) as other,
               closing(Link(open_can(where), time.monotonic_ns)) as listener):
             process = started("run", "--bus", where, "--out", tmp_path / str(attempt))
-            sent = [time.monotonic()]
+            send_times = [time.monotonic()]
             while process.poll() is None:
                 other.send(codec.SYNC, b"")
-                sent.append(time.monotonic())
+                send_times.append(time.monotonic())
                 time.sleep(0.01)
             result = finished(process)
-            heard = {frame.cob_id for frame in listener.poll(0.0)}
-        if result.status == 2 or max(later - earlier for earlier, later in pairwise(sent)) < 0.1:
+            cob_ids = {frame.cob_id for frame in listener.poll(0.0)}
+        if result.status == 2 or max(later - earlier for earlier, later in pairwise(send_times)) < 0.1:
             break
-    assert result.status == 2 and "another rig is active" in result.err and heard == {codec.SYNC}
+    assert result.status == 2 and "another rig is active" in result.err and cob_ids == {codec.SYNC}
 
 
 def wait_for_cycle(link: Link, process: subprocess.Popen[str], cycle: int, limit: float = 300.0) -> int:
@@ -273,7 +274,7 @@ def killed(where: str, folder: Path, cycles: int) -> int:
 
 def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
     """And its nodes end by themselves. A run that itself stood still just then loses more: the best of five counts."""
-    lost = []
+    losses = []
     for attempt in range(5):
         where, folder = spec("udp_multicast"), tmp_path / str(attempt)
         last = killed(where, folder, 1000)
@@ -284,13 +285,13 @@ def test_a_killed_run_loses_half_a_second_at_most(tmp_path: Path) -> None:
         assert result.status == 2 and "rig recover" in result.err
         assert rig("recover", folder / "trace.mcap", "--out", folder / "saved.mcap", "--quiet").status == 0
         assert {"model.toml", "sequence/long.toml"} <= Trace.read(folder / "saved.mcap", all=True).attachments.keys()
-        lost.append(last - int(open_log(folder / "saved.mcap").read_columns("/signals")["cycle"][-1]))
-        assert lost[-1] >= 0
-        if lost[-1] <= 500:
+        losses.append(last - int(open_log(folder / "saved.mcap").read_columns("/signals")["cycle"][-1]))
+        assert losses[-1] >= 0
+        if losses[-1] <= 500:
             break
-    if not lost:
+    if not losses:
         pytest.skip("the machine stood still for so long that each of five runs ended by itself")
-    assert min(lost) <= 500
+    assert min(losses) <= 500
 
 
 STARTS_A_NODE = """
@@ -314,11 +315,11 @@ def test_what_a_rig_has_started_ends_with_it_when_it_is_killed(code: str) -> Non
     """Also a program that knows nothing of the rig, or that is still loading or busy and does not look for it."""
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        started = Path("/proc", process.stdout.readline().strip())
-        assert started.exists()
+        child = Path("/proc", process.stdout.readline().strip())
+        assert child.exists()
         process.kill()
     end = time.monotonic() + 60.0
-    while started.exists() and (started / "stat").read_text().split()[2] != "Z":  # where nobody collects its status
+    while child.exists() and (child / "stat").read_text().split()[2] != "Z":  # where nobody collects its status
         assert time.monotonic() < end
         time.sleep(0.01)
 
@@ -379,19 +380,19 @@ def test_the_memory_of_a_run_is_free_when_it_ends(
     bus_with_nodes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not when Python next looks for reference cycles: many runs in one process would grow in between."""
-    kept: list[weakref.ref[object]] = []
+    references: list[weakref.ref[object]] = []
 
     class NotedSession(Session):
         def run_phases(self) -> None:
             super().run_phases()
-            kept.extend((weakref.ref(self), weakref.ref(self.stage.loop), weakref.ref(self.log.history)))
+            references.extend((weakref.ref(self), weakref.ref(self.stage.loop), weakref.ref(self.log.history)))
 
     monkeypatch.setattr(runner, "Session", NotedSession)
     gc.disable()
     try:
         play(job(), tmp_path / "a")
         play(job(bus=bus_with_nodes, controller="external", plant="external"), tmp_path / "b")
-        assert [each() for each in kept] == [None] * 6
+        assert [each() for each in references] == [None] * 6
     finally:
         gc.enable()
 

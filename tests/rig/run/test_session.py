@@ -221,11 +221,11 @@ def test_a_node_that_sends_nothing_but_emergencies(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(participants, "Firmware", Babbler)
     outcome = play(job(SAFE), tmp_path)
     assert (tmp_path / "verdict.json").stat().st_size < 100_000
-    written = json.loads((tmp_path / "verdict.json").read_text())
-    sent = sum(event.kind == "emcy" for event in outcome.events)
-    assert sent >= 20_000 and written["events_omitted"]["emcy"] == sent - 200
+    verdict = json.loads((tmp_path / "verdict.json").read_text())
+    emergency_count = sum(event.kind == "emcy" for event in outcome.events)
+    assert emergency_count >= 20_000 and verdict["events_omitted"]["emcy"] == emergency_count - 200
     trace = Trace.read(tmp_path, all=True)
-    assert sum(event.kind == "emcy" for event in trace.events) == sent
+    assert sum(event.kind == "emcy" for event in trace.events) == emergency_count
     write_run_page(tmp_path / "trace.mcap", tmp_path / "p.html")
     assert (tmp_path / "p.html").stat().st_size < 2_000_000
 

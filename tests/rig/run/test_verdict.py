@@ -36,12 +36,12 @@ def test_without_checks_nothing_passed(tmp_path: Path) -> None:
 
 def test_the_ram_at_its_stop_and_the_current_at_its_limit_are_reported(tmp_path: Path) -> None:
     outcome = play(job(TO_THE_STOP), tmp_path)
-    found = {limit.signal: limit for limit in outcome.limits}
+    limits = {limit.signal: limit for limit in outcome.limits}
     xj = Trace.read(tmp_path).xj
     first = int(np.argmax(xj > 0.04 - 10e-6))
-    assert found["xj"].limit == 0.04 and found["xj"].t == pytest.approx(first * 1e-3, abs=2e-3)
-    assert found["xj"].seconds == pytest.approx(np.count_nonzero(xj > 0.04 - 10e-6) * 1e-3, abs=2e-3)
-    assert found["cor"].limit == 8e-3 and found["cor"].seconds > 0.1
+    assert limits["xj"].limit == 0.04 and limits["xj"].t == pytest.approx(first * 1e-3, abs=2e-3)
+    assert limits["xj"].seconds == pytest.approx(np.count_nonzero(xj > 0.04 - 10e-6) * 1e-3, abs=2e-3)
+    assert limits["cor"].limit == 8e-3 and limits["cor"].seconds > 0.1
     text = format_report(build_run_report(Trace.read(tmp_path, all=True)))
     assert "limits reached: ram at its stop (40 mm)" in text and "current at its limit (8 mA)" in text
     assert [each["parameter"] for each in build_answer(outcome)["limits"]] == [  # type: ignore[attr-defined]
@@ -72,18 +72,18 @@ def diagnosis(verdict: str) -> dict[str, object]:
     return {"verdict": verdict, "sentence": f"The sentence of {verdict}."}
 
 
-@pytest.mark.parametrize(("found", "verdict", "status"), [
+@pytest.mark.parametrize(("fdi_verdict", "verdict", "status"), [
     ("ACCEPTABLE", "PASS", 0), ("MAINTENANCE", "FAIL", 1), ("NON_NOMINAL", "FAIL", 1), ("SOMETHING_ELSE", "FAIL", 1),
     ("CANNOT_TELL", "PASS", 0)])
-def test_a_fault_that_rig_fdi_finds_fails_the_run(found: str, verdict: str, status: int, tmp_path: Path) -> None:
+def test_a_fault_that_rig_fdi_finds_fails_the_run(fdi_verdict: str, verdict: str, status: int, tmp_path: Path) -> None:
     outcome = run_job(job(SHORT), tmp_path, lambda stage, share: None, lambda: False,
-                      diagnose=lambda trace: diagnosis(found))
+                      diagnose=lambda trace: diagnosis(fdi_verdict))
     assert (outcome.verdict, outcome.status) == (verdict, status) and build_answer(outcome)["verdict"] == verdict
     report = build_run_report(Trace.read(tmp_path, all=True))  # the log alone says so too
     assert report.verdict == verdict
     section = next(section for section in report.sections if section.title == "Faults found by rig fdi")
-    assert section.items[0].text == f"The sentence of {found}."  # type: ignore[union-attr]
-    assert (f"The sentence of {found}" in report.sentence) == (verdict == "FAIL")
+    assert section.items[0].text == f"The sentence of {fdi_verdict}."  # type: ignore[union-attr]
+    assert (f"The sentence of {fdi_verdict}" in report.sentence) == (verdict == "FAIL")
 
 
 def test_without_checks_only_an_acceptable_diagnosis_is_a_pass(tmp_path: Path) -> None:
@@ -113,11 +113,11 @@ faults = [{ kind = "parameter", parameter = "filter.clogging", value = 0.1, star
     out = tmp_path / "run"
     answer = rig("run", str(sequence), "--set", "null_bias.current=1e-5", "--set", "filter.law=linear", "--out",
                  str(out))
-    expected = ("filter.law = linear; null_bias.current = 1e-05 A; fault 'parameter filter.clogging' from 0.1 s")
-    assert f"not nominal  {expected}" in answer.out
+    text = ("filter.law = linear; null_bias.current = 1e-05 A; fault 'parameter filter.clogging' from 0.1 s")
+    assert f"not nominal  {text}" in answer.out
     differences = json.loads((out / "verdict.json").read_text())["differences"]
-    assert differences["text"] == expected and differences["effects"] == ["null_bias"]
+    assert differences["text"] == text and differences["effects"] == ["null_bias"]
     assert differences["parameters"]["null_bias.current"] == 1e-5
-    assert dict(build_run_report(Trace.read(out, all=True)).facts)["differs from nominal"] == expected
+    assert dict(build_run_report(Trace.read(out, all=True)).facts)["differs from nominal"] == text
     nominal = rig("run", str(sequence), "--out", str(out), "--json")
     assert nominal.json["differences"]["text"] == "fault 'parameter filter.clogging' from 0.1 s"

@@ -19,13 +19,13 @@ class Watch:
     def __init__(self) -> None:
         self._watch = SilenceWatch(2000 * MS)
 
-    def look(self, since_ms: int, until_ms: int, heard: dict[int, int], answering: Collection[int] = ()) -> set[int]:
-        """The nodes found at the end; `heard`: when the last heartbeat of each node came, ms."""
-        found = {}
+    def look(self, since_ms: int, until_ms: int, heard_ms: dict[int, int], answering: Collection[int] = ()) -> set[int]:
+        """The nodes found at the end; `heard_ms`: when the last heartbeat of each node came, ms."""
+        silent_nodes = {}
         for t in range(since_ms, until_ms, 20):
-            found = self._watch.find_silent(t * MS, {node: at * MS for node, at in heard.items()}, answering)
-        assert all(seconds >= 2.0 for seconds in found.values())
-        return set(found)
+            silent_nodes = self._watch.find_silent(t * MS, {node: at * MS for node, at in heard_ms.items()}, answering)
+        assert all(seconds >= 2.0 for seconds in silent_nodes.values())
+        return set(silent_nodes)
 
 
 def test_a_node_without_heartbeat_and_answer_is_found_until_it_is_heard_again() -> None:
