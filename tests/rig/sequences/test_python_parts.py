@@ -84,8 +84,8 @@ def test_the_example_of_the_page_works(tmp_path: Path) -> None:
 def run_with(folder: Path, old: str, new: str, *, in_code: bool = True) -> CommandResult:
     source = CODE if in_code else SEQUENCE
     assert old in source
-    changed = source.replace(old, new)
-    file = write(folder, code=changed) if in_code else write(folder, changed)
+    text = source.replace(old, new)
+    file = write(folder, code=text) if in_code else write(folder, text)
     return rig("run", file, "--out", folder / "out")
 
 
@@ -104,8 +104,8 @@ def run_with(folder: Path, old: str, new: str, *, in_code: bool = True) -> Comma
 @pytest.mark.filterwarnings("ignore:.*encountered in")
 def test_an_error_in_the_code_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
     result = run_with(tmp_path, old, new)
-    (told,) = [text for text in result.err.splitlines() if text.startswith("rig run:")]
-    assert result.status == 2 and re.search(line, told), result.err
+    (message,) = [text for text in result.err.splitlines() if text.startswith("rig run:")]
+    assert result.status == 2 and re.search(line, message), result.err
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [
@@ -121,10 +121,10 @@ def test_a_wrong_entry_is_one_line(tmp_path: Path, old: str, new: str, line: str
     assert result.status == 2 and len(result.err.splitlines()) == 1 and re.search(line, result.err), result.err
 
 
-@pytest.mark.parametrize(("returned", "why"), [("None", "no value"), ("float('nan')", "returned nan"),
-                                               ("'x'", "not a number")])
-def test_a_value_that_cannot_be_measured_fails_the_check(returned: str, why: str, tmp_path: Path) -> None:
-    result = run_with(tmp_path, "return 1e6 * np.abs(window.error).max()", f"return {returned}")
+@pytest.mark.parametrize(("expression", "why"), [("None", "no value"), ("float('nan')", "returned nan"),
+                                                 ("'x'", "not a number")])
+def test_a_value_that_cannot_be_measured_fails_the_check(expression: str, why: str, tmp_path: Path) -> None:
+    result = run_with(tmp_path, "return 1e6 * np.abs(window.error).max()", f"return {expression}")
     detail = json.loads((tmp_path / "out" / "verdict.json").read_text())["checks"][0]["detail"]
     assert result.status == 1 and why in detail
 

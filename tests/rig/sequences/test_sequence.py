@@ -297,8 +297,8 @@ def test_a_bad_sequence_is_refused_in_one_line(text: str, message: str) -> None:
 def test_lines_of_keys() -> None:
     text = ('a = "x [ {"\nb = [\n  { c = 1 }, # ]\n  { c = [1,\n 2] },\n]\n["d e".f]\ng.h = """\n\n"""\n'
             "[[i]]\n[[i]]\nj = 2024-01-01 10:00:00\nk = 1\n")
-    expected = {"b[1].c[1]": 5, "b[0].c": 3, "d e.f.g.h": 8, "i[1]": 12, "i[1].k": 14}
-    assert {path: tables.find_line(text, path) for path in expected} == expected
+    lines = {"b[1].c[1]": 5, "b[0].c": 3, "d e.f.g.h": 8, "i[1]": 12, "i[1].k": 14}
+    assert {path: tables.find_line(text, path) for path in lines} == lines
 
 
 @pytest.mark.parametrize("name", sorted(Path(entry.name).stem for entry in files("rig.sequences").iterdir()
@@ -431,8 +431,8 @@ def test_words_stand_for_their_numbers_and_what_fits_together_is_taken() -> None
     """)
     assert s.model.overrides == {"filter.law": "pressure"}
     model = load_model("eha").replace(s.model.overrides)
-    asked = Schedule(s.plan(0), {**model.values, "null_bias.current": 0.0})
-    at = [asked.list_parameters(k) for k in (0, 100, 999, 1000)]
+    schedule = Schedule(s.plan(0), {**model.values, "null_bias.current": 0.0})
+    at = [schedule.list_parameters(k) for k in (0, 100, 999, 1000)]
     assert [values["filter.law"] for values in at] == [0.0, 1.0, 1.0, 0.0]
     assert [values["spool.static_friction"] for values in at] == [5.0, 5.0, 70.0, 5.0]
 
@@ -475,12 +475,12 @@ def test_the_table_of_a_frame_says_what_happens_to_each() -> None:
     """Compiled loops read tables."""
     plan = Plan(faults=(*ONE_OF_EACH, Lost(frame="feedback", start=0.15, count=1)), stop=2000, seed=3)
     s = Schedule(plan, {"filter.clogging": 0.0})
-    found = set()
+    codes = set()
     for name in ("command", "sync", "feedback", "valve_state", "drive"):
         hits = s.list_frame_hits(name).tolist()
         assert hits == [[k, *s.find_action(name, k)] for k in hit_cycles(s, name, 2100)]
-        found |= {code for _, code, _ in hits}
-    assert found == {DROP, DELAY, DOUBLE, CORRUPT, CUT}
+        codes |= {code for _, code, _ in hits}
+    assert codes == {DROP, DELAY, DOUBLE, CORRUPT, CUT}
 
 
 def test_frames_of_other_nodes() -> None:
