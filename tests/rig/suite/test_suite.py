@@ -96,13 +96,13 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CommandResult
 
 def test_each_case_has_its_verdict_and_the_worst_is_that_of_the_suite(suite: tuple[Path, CommandResult]) -> None:
     folder, result = suite
-    told = json.loads((folder / "suite.json").read_text())
-    cases = {case["name"]: case for case in told["cases"]}
+    report = json.loads((folder / "suite.json").read_text())
+    cases = {case["name"]: case for case in report["cases"]}
     assert list(cases) == ["short, seed 1", "short, seed 2", "weak, jack.mass=90", "weak, jack.mass=110", "crash",
                            "fail", "hang"]
     assert [(case["verdict"], case["seed"]) for case in cases.values()] == [
         ("PASS", 1), ("PASS", 2), ("FAIL", 0), ("FAIL", 0), ("ERROR", 0), ("ERROR", 0), ("ERROR", 0)], result
-    assert (result.status, told["verdict"], told["jobs"]) == (1, "ERROR", 2)
+    assert (result.status, report["verdict"], report["jobs"]) == (1, "ERROR", 2)
     for name, why in (("crash", r"its process was ended by SIGKILL"), ("hang", "it took longer than 1 s"),
                       ("fail", r".*own\.py:13: fail: expected .*AttributeError.*")):
         assert re.fullmatch(why, cases[name]["why"])
@@ -134,12 +134,12 @@ def test_folders_and_page(suite: tuple[Path, CommandResult]) -> None:
 
 def test_requirements_are_traced(suite: tuple[Path, CommandResult]) -> None:
     folder, result = suite
-    told = json.loads((folder / "suite.json").read_text())
-    traced = {each["id"]: each for each in told["requirements"]}
-    assert list(traced) == ["R-1", "R-2", "R-9", "R-3"]
-    assert [each["verdict"] for each in traced.values()] == ["FAIL", "FAIL", "NOT_COVERED", "OPEN"]
-    assert [each["check"] for each in traced["R-2"]["checks"]] == ["whole run"] * 2
-    assert {(each["case"], each["verdict"]) for each in traced["R-3"]["checks"]} == {
+    report = json.loads((folder / "suite.json").read_text())
+    requirements = {each["id"]: each for each in report["requirements"]}
+    assert list(requirements) == ["R-1", "R-2", "R-9", "R-3"]
+    assert [each["verdict"] for each in requirements.values()] == ["FAIL", "FAIL", "NOT_COVERED", "OPEN"]
+    assert [each["check"] for each in requirements["R-2"]["checks"]] == ["whole run"] * 2
+    assert {(each["case"], each["verdict"]) for each in requirements["R-3"]["checks"]} == {
         ("crash", "OPEN"), ("fail", "OPEN"), ("hang", "OPEN")}
     assert "note      no check verifies R-9" in result.out
 
@@ -149,9 +149,9 @@ def test_junit_is_valid_and_complete(suite: tuple[Path, CommandResult]) -> None:
     root = read_valid_junit(folder / "junit.xml")
     assert [each.get("errors") for each in root] == ["0"] * 4 + ["1"] * 3
     weak = root.find("testsuite[@name='weak, jack.mass=90']")
-    (failed,) = weak.findall("testcase[failure]")
-    assert failed.get("name") == "overshoot" and "requirement R-1" in str(failed.findtext("system-out"))
-    assert re.fullmatch(r"measured [\d.]+ %, limits <= 30 %", str(failed[0].get("message")))
+    (testcase,) = weak.findall("testcase[failure]")
+    assert testcase.get("name") == "overshoot" and "requirement R-1" in str(testcase.findtext("system-out"))
+    assert re.fullmatch(r"measured [\d.]+ %, limits <= 30 %", str(testcase[0].get("message")))
     assert {"R-1: overshoot", "R-2: whole run"} <= {each.get("value") for each in weak.findall("properties/property")}
 
 
@@ -199,20 +199,20 @@ def test_ctrl_c_writes_what_is_done(tmp_path: Path) -> None:
     assert grown(tmp_path / "own.py.hangs", 0, process)
     result = interrupted(process)
     assert result.status == 130, result
-    told = json.loads((tmp_path / "out" / "suite.json").read_text())
-    assert [case["verdict"] for case in told["cases"]] == ["PASS", "NOT_RUN", "NOT_RUN"]
+    report = json.loads((tmp_path / "out" / "suite.json").read_text())
+    assert [case["verdict"] for case in report["cases"]] == ["PASS", "NOT_RUN", "NOT_RUN"]
     assert len(read_valid_junit(tmp_path / "j.xml").findall("testsuite/testcase[skipped]")) == 2
     assert "Traceback" not in result.err and "3 at" not in result.out
     assert rig("report", tmp_path / "out" / "hang-seed-1", "--quiet").status == 0  # its log was closed
 
 
-def make_result(verdict: str, *passed: bool, fdi: dict[str, str] | None = None) -> CaseResult:
+def make_result(verdict: str, *passes: bool, fdi: dict[str, str] | None = None) -> CaseResult:
     """A result of a case with checks "a", "b", .. that verify R-1; diagnosed if `fdi` is given."""
     checks = tuple(CheckResult(name=name, kind="max_error", signal="xj", value=1.0, unit="m", low=0.0, high=2.0,
                                passed=is_passed, t0=0.0, t1=1.0, requirement="R-1")
-                   for name, is_passed in zip("abc", passed, strict=False))
-    planned = tuple(JudgedCheck(check.name, ("R-1",)) for check in checks)
-    case = Case("case", JobChoice(is_diagnosed=bool(fdi)), 1.0, ("R-2",), Path("case"), planned)
+                   for name, is_passed in zip("abc", passes, strict=False))
+    judged_checks = tuple(JudgedCheck(check.name, ("R-1",)) for check in checks)
+    case = Case("case", JobChoice(is_diagnosed=bool(fdi)), 1.0, ("R-2",), Path("case"), judged_checks)
     return CaseResult(case, verdict, "because", 1.0, checks, fdi=fdi or {})
 
 
@@ -228,9 +228,9 @@ def test_the_exit_status_is_the_worst(verdicts: str, status: int, worst: str) ->
 def test_a_late_bench_proves_nothing(tmp_path: Path) -> None:
     """Neither a passed nor a failed check of a run with invalid timing verifies a requirement; JUnit skips failures."""
     late = make_result("INVALID_TIMING", True, False)
-    traced = trace_requirements([late.judged], {})
-    assert [(each.id, each.verdict) for each in traced] == [("R-2", "OPEN"), ("R-1", "OPEN")]
-    assert traced[1].evidence == (Evidence("case", "a", "OPEN"), Evidence("case", "b", "OPEN"))
+    requirements = trace_requirements([late.judged], {})
+    assert [(each.id, each.verdict) for each in requirements] == [("R-2", "OPEN"), ("R-1", "OPEN")]
+    assert requirements[1].evidence == (Evidence("case", "a", "OPEN"), Evidence("case", "b", "OPEN"))
     (tmp_path / "j.xml").write_text(write_junit("t", [late, make_result("ABORTED", True), make_result("NOT_JUDGED")]))
     root = read_valid_junit(tmp_path / "j.xml")
     assert [[child.tag for child in case if child.tag != "system-out"] for case in root.iter("testcase")] == [
@@ -289,9 +289,9 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CommandResult
 
 def test_a_fault_fails_its_case_and_no_other(units: tuple[Path, CommandResult]) -> None:
     folder, result = units
-    told = json.loads((folder / "suite.json").read_text())
-    healthy, clogged, plain = told["cases"]
-    assert [case["verdict"] for case in told["cases"]] == ["PASS", "FAIL", "PASS"] and result.status == 1, result
+    report = json.loads((folder / "suite.json").read_text())
+    healthy, clogged, plain = report["cases"]
+    assert [case["verdict"] for case in report["cases"]] == ["PASS", "FAIL", "PASS"] and result.status == 1, result
     assert (healthy["fdi"]["verdict"], clogged["fdi"]["verdict"], plain["fdi"]) == ("ACCEPTABLE", "NON_NOMINAL", {})
     assert clogged["fdi"]["level"]["filter_clogging"] == "non_nominal"
     size = clogged["fdi"]["refined"]["kintas"]
@@ -313,13 +313,13 @@ def test_junit_has_the_diagnosis_as_a_test_of_its_own(units: tuple[Path, Command
     folder, _ = units
     healthy, clogged, plain = read_valid_junit(folder / "junit.xml")
     assert [each.get("failures") for each in (healthy, clogged, plain)] == ["0", "1", "0"]
-    (failed,) = clogged.findall("testcase[failure]")
-    assert failed.get("name") == "rig fdi" and "Kintas 0." in str(failed.findtext("failure"))
+    (testcase,) = clogged.findall("testcase[failure]")
+    assert testcase.get("name") == "rig fdi" and "Kintas 0." in str(testcase.findtext("failure"))
     assert "FSS " in str(healthy.findtext("testcase[@name='rig fdi']/system-out"))
     assert plain.find("testcase[@name='rig fdi']") is None
 
 
-@pytest.mark.parametrize(("verdict", "word", "passed", "problems", "reason"), [
+@pytest.mark.parametrize(("verdict", "word", "passes", "problems", "reason"), [
     ("FAIL", "SOMETHING_ELSE", [True], ["", "", "failure"], "rig fdi: SOMETHING_ELSE"),
     ("FAIL", "SOMETHING_ELSE", [False, False], ["", "failure", "failure", "failure"],
      "a and 1 more; rig fdi: SOMETHING_ELSE"),
@@ -327,13 +327,13 @@ def test_junit_has_the_diagnosis_as_a_test_of_its_own(units: tuple[Path, Command
     ("FAIL", "ACCEPTABLE", [True], ["failure", "", ""], "because"),  # it did not end as the sequence says
     ("PASS", "CANNOT_TELL", [True], ["", "", "skipped"], "rig fdi cannot tell"),
     ("INVALID_TIMING", "SOMETHING_ELSE", [True], ["error", "", "skipped"], "because")])
-def test_what_the_diagnosis_means_for_the_case(verdict: str, word: str, passed: list[bool], problems: list[str],
+def test_what_the_diagnosis_means_for_the_case(verdict: str, word: str, passes: list[bool], problems: list[str],
                                                reason: str, tmp_path: Path) -> None:
-    result = make_result(verdict, *passed, fdi={"verdict": word, "sentence": "In words."})
+    result = make_result(verdict, *passes, fdi={"verdict": word, "sentence": "In words."})
     (tmp_path / "j.xml").write_text(write_junit("t", [result]))
-    found = [[child.tag for child in case if child.tag != "system-out"]
-             for case in read_valid_junit(tmp_path / "j.xml").iter("testcase")]
-    assert found == [[each] if each else [] for each in problems] and result.reason == reason
+    tags = [[child.tag for child in case if child.tag != "system-out"]
+            for case in read_valid_junit(tmp_path / "j.xml").iter("testcase")]
+    assert tags == [[each] if each else [] for each in problems] and result.reason == reason
 
 
 FAR = """
@@ -350,23 +350,23 @@ guards = [{ name = "far out", signal = "xj", high = 20.0, unit = "mm" }]
 
 
 def test_a_sequence_within_the_limits(tmp_path: Path) -> None:
-    told = answer("check", "preflight")
-    largest = {each["name"]: (each["value"], each["section"]) for each in told["demands"]}
-    assert (told["verdict"], told["problems"], told["not_predicted"]) == ("WITHIN_LIMITS", [], ["no emergency"])
-    assert told["durations"] == {"setup": 0.5, "main": 13.5, "cleanup": 0.5}
+    report = answer("check", "preflight")
+    largest = {each["name"]: (each["value"], each["section"]) for each in report["demands"]}
+    assert (report["verdict"], report["problems"], report["not_predicted"]) == ("WITHIN_LIMITS", [], ["no emergency"])
+    assert report["durations"] == {"setup": 0.5, "main": 13.5, "cleanup": 0.5}
     assert (largest["position"][0], largest["step"]) == (5e-3, (5e-3, "step 5 mm"))
     assert largest["speed"] == (pytest.approx(2 * np.pi * 20 * 1e-3, rel=0.03), "chirp")
     assert largest["acceleration"][0] == pytest.approx((2 * np.pi * 20) ** 2 * 1e-3, rel=0.03)
-    assert {each["signal"] for each in told["predicted"]["limits"]} == {"xs", "cor"}  # steps; no reason to refuse it
+    assert {each["signal"] for each in report["predicted"]["limits"]} == {"xs", "cor"}  # steps; no reason to refuse it
 
 
 def test_the_prediction_is_that_of_the_run(preflight: Path) -> None:
     """Predicted without a bus, whose frames round the signals: the checks come out alike."""
     dry = make_dry_run(job((ROOT / "rig" / "sequences" / "preflight.toml").read_text()))
     checks = json.loads((preflight / "verdict.json").read_text())["checks"]
-    measured = {check["name"]: check["value"] for check in checks}
+    run_values = {check["name"]: check["value"] for check in checks}
     assert {check.name: check.value for check in dry.checks} == pytest.approx(
-        {check.name: measured[check.name] for check in dry.checks}, rel=0.25) and len(dry.checks) == 16
+        {check.name: run_values[check.name] for check in dry.checks}, rel=0.25) and len(dry.checks) == 16
 
 
 def test_what_is_beyond_the_limits(tmp_path: Path) -> None:
@@ -396,15 +396,15 @@ faults = [
 def test_the_faults_of_a_sequence_are_listed_and_drawn(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text(SHORT + FAULTS)
     result = rig("check", tmp_path / "s.toml", "--json")
-    listed = {each["name"]: each for each in result.json["faults"]}
-    assert {name: (each["kind"], each["target"], each["t0"], each["t1"]) for name, each in listed.items()} == {
+    faults = {each["name"]: each for each in result.json["faults"]}
+    assert {name: (each["kind"], each["target"], each["t0"], each["t1"]) for name, each in faults.items()} == {
         "parameter filter.clogging": ("parameter", "filter.clogging", 0.05, 0.25),
         "some": ("lost", "frame drive", 0.1, 0.106), "biased": ("offset", "sensor xj", 0.3, 0.35),
         "mute": ("heartbeat", "node plant", 0.2, 0.25), "reset node": ("reset", "node controller", 0.125, 0.126)}
-    assert listed["biased"]["duration"] == pytest.approx(0.05)
-    assert listed["parameter filter.clogging"]["size"] == "0 to 0.900 within 100 ms"
+    assert faults["biased"]["duration"] == pytest.approx(0.05)
+    assert faults["parameter filter.clogging"]["size"] == "0 to 0.900 within 100 ms"
     result = rig("check", tmp_path / "s.toml", "--out", tmp_path / "s.html")
     text = " ".join(result.out.split())
     assert "biased sensor xj 0.300 0.350 100 um" in text and "ends with main at 0.35 s, not at 9 s" in text
     page = (tmp_path / "s.html").read_text()
-    assert page.count("#ffd8a8") > 5 and all(f">{name}" in page.replace("> ", ">") for name in listed)
+    assert page.count("#ffd8a8") > 5 and all(f">{name}" in page.replace("> ", ">") for name in faults)
