@@ -49,21 +49,22 @@ from rig.view.viewer import ViewerError, find_free_port, is_listening
 def test_every_record_arrives_once_and_in_order_while_the_log_grows(tmp_path: Path) -> None:
     """From before the log is there, in any pieces, and although it is moved; nothing more when it is whole."""
     whole = record_run(tmp_path / "whole.mcap", stop=1000).read_bytes()
-    log, moved = tmp_path / "trace.mcap", tmp_path / "moved.mcap"
+    log, moved_log = tmp_path / "trace.mcap", tmp_path / "moved.mcap"
     batches = follow_log(log)
-    found = next(batches)
+    records = next(batches)
     with log.open("wb", buffering=0) as file:
         for start in range(0, len(whole), 30_000):
             file.write(whole[start:start + 30_000])
-            found += next(batches)
+            records += next(batches)
             if start == 60_000:
-                log.rename(moved)
+                log.rename(moved_log)
     assert next(batches) == []
-    written = [record for _, _, *rows in build_cycles() if rows[0].cycle < 1000 for record in rows]
-    assert list(map(repr, written)) == [repr(record) for _, record in found if isinstance(record, Signals | Timing)]
-    trace = Trace.read(moved, all=True)
-    assert [record.text for _, record in found if isinstance(record, Event)] == [event.text for event in trace.events]
-    assert {type(record) for _, record in found} == {Signals, Timing, Event, NmtState, CheckResult}
+    cycle_records = [record for _, _, *rows in build_cycles() if rows[0].cycle < 1000 for record in rows]
+    assert list(map(repr, cycle_records)) == [
+        repr(record) for _, record in records if isinstance(record, Signals | Timing)]
+    trace = Trace.read(moved_log, all=True)
+    assert [record.text for _, record in records if isinstance(record, Event)] == [event.text for event in trace.events]
+    assert {type(record) for _, record in records} == {Signals, Timing, Event, NmtState, CheckResult}
 
 
 Records = list[tuple[int, Record]]
@@ -86,17 +87,17 @@ def add(run: LiveRun, records: Records) -> None:
 def test_checks_turn_when_their_window_is_over(preflight: Path) -> None:
     run, records, trace = make_run(preflight)
     final = {check.name: check for check in trace.checks}
-    seen: dict[str, list[str]] = {name: [] for name in run.checks}
+    words: dict[str, list[str]] = {name: [] for name in run.checks}
     main = int(np.argmax(trace.phase == 1))
     for first in range(0, len(records) // 2, 250):
         add(run, records[2 * first:2 * first + 500])
         for name, state in run.checks.items():
-            if seen[name][-1:] != [state.word]:
-                seen[name].append(state.word)
+            if words[name][-1:] != [state.word]:
+                words[name].append(state.word)
             check = final[name]
             if state.word == "PASS" and not np.isnan(check.t1):
                 assert first + 250 >= main + round(1000 * check.t1) - 250, name
-    assert seen["overshoot, 5 mm"] == seen["position"] == ["waits", "measures", "PASS"]
+    assert words["overshoot, 5 mm"] == words["position"] == ["waits", "measures", "PASS"]
     for name, state in run.checks.items():
         assert state.word == ("PASS" if final[name].passed else "FAIL"), name
         np.testing.assert_allclose(state.result.value, final[name].value, rtol=1e-9, err_msg=name)
@@ -216,27 +217,28 @@ SHOWN = {"nodes": r"node 2 controller operational|node 3 plant      operational"
 def test_screen_follows_the_run_and_ctrl_c_restores_the_terminal(tmp_path: Path) -> None:
     """A run that lasts until all of it was seen, however slowly the screen is drawn."""
     sequence = write_file(tmp_path / "watched.toml", WATCHED)
-    seen: dict[str, set[str]] = {name: set() for name in ("plot", *SHOWN)}
-    stopped: list[int] = []
+    sightings: dict[str, set[str]] = {name: set() for name in ("plot", *SHOWN)}
+    interrupts: list[int] = []
 
     def look(text: str, number: int) -> None:
         for frame in split_frames(text)[1:]:
             if "Position [mm]" not in frame:
                 continue
-            seen["plot"].add("".join(letter for letter in frame if 0x2800 < ord(letter) < 0x2900))
+            sightings["plot"].add("".join(letter for letter in frame if 0x2800 < ord(letter) < 0x2900))
             for name, pattern in SHOWN.items():
-                seen[name] |= set(re.findall(pattern, frame))
-        is_complete = len(seen["plot"]) >= 3 and len(seen["nodes"]) == 2 and all(seen.values())
-        if is_complete and not stopped:
-            stopped.append(number)
+                sightings[name] |= set(re.findall(pattern, frame))
+        is_complete = len(sightings["plot"]) >= 3 and len(sightings["nodes"]) == 2 and all(sightings.values())
+        if is_complete and not interrupts:
+            interrupts.append(number)
             os.kill(number, signal.SIGINT)
 
     text, status = run_in_terminal([str(sequence), "--live", "--out", str(tmp_path / "run")], look)
     for begin, end in (("\x1b[?1049h", "\x1b[?1049l"), ("\x1b[?25l", "\x1b[?25h")):  # another screen, no cursor
         assert text.rindex(end) > text.rindex(begin)
     assert text.index("\x1b[?1049l") < text.index("ABORTED") and (tmp_path / "run" / "verdict.json").exists()
-    assert stopped and status == 130, {name: sorted(each)[:2] for name, each in seen.items()}
-    assert "overshoot" in seen["passed"] and "position" in seen["measures"] and "position" not in seen["passed"]
+    assert interrupts and status == 130, {name: sorted(each)[:2] for name, each in sightings.items()}
+    assert ("overshoot" in sightings["passed"] and "position" in sightings["measures"]
+            and "position" not in sightings["passed"])
 
 
 def test_lines_without_a_terminal(tmp_path: Path) -> None:
@@ -371,11 +373,11 @@ def rows(trace: Trace, tmp_path_factory: pytest.TempPathFactory) -> Rows:
 
 @needs_viewer
 def test_recording_holds_every_line(trace: Trace, rows: Rows) -> None:
-    drawn = {"/position/command": trace.com * 1e3, "/position/ram": trace.xj * 1e3, "/current/current": trace.cor * 1e3,
+    lines = {"/position/command": trace.com * 1e3, "/position/ram": trace.xj * 1e3, "/current/current": trace.cor * 1e3,
              "/error/error": (trace.com - trace.xj) * 1e6, "/pressure/pressure": trace.p12 / 1e5,
              "/spool/spool": trace.xs * 1e6, "/timing/response": trace.timing.response * 1e6,
              "/timing/work": trace.timing.work * 1e6}
-    for entity, values in drawn.items():
+    for entity, values in lines.items():
         np.testing.assert_allclose(rows[entity], np.column_stack([trace.t, values]), rtol=1e-9, atol=1e-8)
 
 
@@ -471,38 +473,38 @@ def read_values(rows: Rows, entity: str) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def compared(folder: Path) -> tuple[Path, str]:
+def recording(folder: Path) -> tuple[Path, str]:
     """The recording of `rig view --compare` with an added effect, and the verdict."""
-    told = answer("view", folder / "run.csv", "--compare", "--set", BIAS, "--out", folder / "compare.rrd")
-    return folder / "compare.rrd", told["verdict"]
+    report = answer("view", folder / "run.csv", "--compare", "--set", BIAS, "--out", folder / "compare.rrd")
+    return folder / "compare.rrd", report["verdict"]
 
 
 @needs_viewer
-def test_the_comparison_holds_measured_model_residual_and_floor(folder: Path, compared: tuple[Path, str]) -> None:
-    rows = read_recording(compared[0])
-    found = compare(Trace.read(folder / "run.csv"), Model().replace({"null_bias.current": 1.5e-4}))
-    assert compared[1] == found.verdict and found.verdict != "MODEL_INCOMPLETE"
-    for name, scale, shown in (("xj", 1e3, 1e6), ("p12", 1e-5, 1e-5), ("xs", 1e6, 1e6)):
-        np.testing.assert_allclose(read_values(rows, f"/{name}/1_measured"), found.trace.column(name) * scale)
-        np.testing.assert_allclose(read_values(rows, f"/{name}/3_model"), found.replay.model[name] * scale)
+def test_the_comparison_holds_measured_model_residual_and_floor(folder: Path, recording: tuple[Path, str]) -> None:
+    rows = read_recording(recording[0])
+    comparison = compare(Trace.read(folder / "run.csv"), Model().replace({"null_bias.current": 1.5e-4}))
+    assert recording[1] == comparison.verdict and comparison.verdict != "MODEL_INCOMPLETE"
+    for name, scale, residual_scale in (("xj", 1e3, 1e6), ("p12", 1e-5, 1e-5), ("xs", 1e6, 1e6)):
+        np.testing.assert_allclose(read_values(rows, f"/{name}/1_measured"), comparison.trace.column(name) * scale)
+        np.testing.assert_allclose(read_values(rows, f"/{name}/3_model"), comparison.replay.model[name] * scale)
         residual = read_values(rows, f"/residual_{name}/2_model")
-        np.testing.assert_allclose(residual, found.replay.residual[name] * shown)
-        floor = NOISE_BAND_RATIO * found.signals[name].floor.value * shown
+        np.testing.assert_allclose(residual, comparison.replay.residual[name] * residual_scale)
+        floor = NOISE_BAND_RATIO * comparison.signals[name].floor.value * residual_scale
         assert read_values(rows, f"/residual_{name}/3_floor_high") == pytest.approx([floor, floor])
         assert read_values(rows, f"/residual_{name}/3_floor_low") == pytest.approx([-floor, -floor])
     lane = [word for _, word in rows["/error_over_floor/model"] if word]
-    assert lane == [format_ratio(place.ratio) for place in sorted(found.where, key=lambda place: place.t0)]
+    assert lane == [format_ratio(place.ratio) for place in sorted(comparison.where, key=lambda place: place.t0)]
 
 
 @needs_viewer
-def test_before_the_change_is_the_model_without_the_added_effect(folder: Path, compared: tuple[Path, str]) -> None:
-    rows, names = read_recording(compared[0]), read_names(compared[0])
+def test_before_the_change_is_the_model_without_the_added_effect(folder: Path, recording: tuple[Path, str]) -> None:
+    rows, names = read_recording(recording[0]), read_names(recording[0])
     before, text = compare(Trace.read(folder / "run.csv"), Model()), str(rows["/log/result"][0][1])
     np.testing.assert_allclose(read_values(rows, "/residual_xj/1_before"), before.replay.residual["xj"] * 1e6)
     np.testing.assert_allclose(read_values(rows, "/xs/2_before"), before.replay.model["xs"] * 1e6)
     assert (names["/residual_xj/1_before"], names["/xj/1_measured"]) == ("before the change", "XJ measured")
     assert "/error_over_floor/before" in rows
-    assert text.startswith(f"```text\n{compared[1]}") and "Before the change:\n\n```text\nMODEL_INCOMPLETE" in text
+    assert text.startswith(f"```text\n{recording[1]}") and "Before the change:\n\n```text\nMODEL_INCOMPLETE" in text
 
 
 @needs_viewer
@@ -511,14 +513,14 @@ def test_runs_are_overlaid_and_subtracted_on_the_time_of_the_first(folder: Path,
     assert answer("view", *sources, "--out", tmp_path / "x.rrd")["verdict"] == "DIFFERENT"
     rows, names = read_recording(tmp_path / "x.rrd"), read_names(tmp_path / "x.rrd")
     traces = [Trace.read(source) for source in sources]
-    found = compare_runs(sources, traces)
+    differences = compare_runs(sources, traces)
     assert names["/xj/00_A"] == "A healthy.csv" and names["/difference_xj/01_B"] == "B - A"
     np.testing.assert_allclose(read_values(rows, "/xj/01_B"), traces[1].xj * 1e3)
     assert {round(t0 - t1, 6) for (t0, _), t1 in zip(rows["/xj/02_C"], traces[2].t, strict=True)} == {-0.25}
-    for number, pair in enumerate(found.pairs, 1):
+    for number, pair in enumerate(differences.pairs, 1):
         for name, scale in (("xj", 1e6), ("p12", 1e-5), ("xs", 1e6)):
-            drawn = rows[f"/difference_{name}/{number:02}_{pair.run.label}"]
-            np.testing.assert_allclose(drawn, np.column_stack([pair.t, pair.differences[name] * scale]), atol=1e-8)
+            difference = rows[f"/difference_{name}/{number:02}_{pair.run.label}"]
+            np.testing.assert_allclose(difference, np.column_stack([pair.t, pair.differences[name] * scale]), atol=1e-8)
     assert np.abs(read_values(rows, "/difference_xj/02_C")).max() < 1e-6  # um; C is A, later
     text = str(rows["/log/result"][0][1])
     assert "DIFFERENT" in text and "B - A  XJ" in text and "aligned by the command" in text
