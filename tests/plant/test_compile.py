@@ -61,16 +61,16 @@ def child(folder: Path, *arguments: Path) -> list[float]:
 
 def test_a_changed_effect_is_never_served_by_old_code_and_a_renamed_file_by_its_own(tmp_path: Path) -> None:
     """Kept code names the types of the memory by their module, which has the name of the user's file."""
-    file, changed, renamed = (tmp_path / name for name in ("mine.py", "changed.py", "renamed.py"))
+    file, edited_file, renamed_file = (tmp_path / name for name in ("mine.py", "changed.py", "renamed.py"))
     file.write_text(HOLD.format(scale=1.0))
-    changed.write_text(HOLD.format(scale=1.0).replace("SCALE * p", "2.0 * SCALE * p"))
-    first = child(tmp_path, file, changed)  # compiled after the edit, from the code read before it
+    edited_file.write_text(HOLD.format(scale=1.0).replace("SCALE * p", "2.0 * SCALE * p"))
+    first = child(tmp_path, file, edited_file)  # compiled after the edit, from the code read before it
     second = child(tmp_path, file)  # the edited file
     assert first != second
     file.write_text(HOLD.format(scale=2.0))  # only a constant differs from the first
     assert child(tmp_path, file) == second
-    renamed.write_text(HOLD.format(scale=1.0))
-    assert child(tmp_path, renamed) == first
+    renamed_file.write_text(HOLD.format(scale=1.0))
+    assert child(tmp_path, renamed_file) == first
 
 
 def test_fingerprint_sees_what_a_function_depends_on() -> None:
@@ -92,21 +92,21 @@ def test_fingerprint_sees_what_a_function_depends_on() -> None:
 def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("HOME", str(tmp_path))
-    for own, common, place in (("a", "b", "a"), ("", "b", "b/eha-rig"), ("", "", ".cache/eha-rig"),
-                               ("file/below", "b", None)):  # the last cannot be made: fall back
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / common) if common else "")
-        monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / own) if own else "")
-        assert place is None or find_cache_folder() == tmp_path / place
+    for eha_cache, xdg_cache, path in (("a", "b", "a"), ("", "b", "b/eha-rig"), ("", "", ".cache/eha-rig"),
+                                       ("file/below", "b", None)):  # the last cannot be made: fall back
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / xdg_cache) if xdg_cache else "")
+        monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path / eha_cache) if eha_cache else "")
+        assert path is None or find_cache_folder() == tmp_path / path
     monkeypatch.setattr(compile.tempfile, "gettempdir", lambda: str(tmp_path))
-    taken = tmp_path / f"eha-rig-{os.getuid()}"
-    assert find_cache_folder() == taken
-    taken.chmod(0o777)  # no code is loaded from a folder that others can write
-    assert find_cache_folder() != taken and find_cache_folder() == find_cache_folder()
+    folder = tmp_path / f"eha-rig-{os.getuid()}"
+    assert find_cache_folder() == folder
+    folder.chmod(0o777)  # no code is loaded from a folder that others can write
+    assert find_cache_folder() != folder and find_cache_folder() == find_cache_folder()
     assert find_cache_folder().stat().st_mode & 0o077 == 0
-    taken.chmod(0o700)
-    taken.rename(tmp_path / "other")
-    taken.symlink_to(tmp_path / "other")
-    assert find_cache_folder() != taken
+    folder.chmod(0o700)
+    folder.rename(tmp_path / "other")
+    folder.symlink_to(tmp_path / "other")
+    assert find_cache_folder() != folder
 
 
 COUNT_COMPILATIONS = """
@@ -153,10 +153,10 @@ def test_the_second_process_runs_without_numba_to_the_same_bits_and_a_damaged_fi
                                                                                                     ) -> None:
     imported, state = run_process(tmp_path)
     assert imported == "True" and run_process(tmp_path) == ("False", state)
-    (stored,) = tmp_path.glob("*/advance.*.o")
-    data = bytearray(stored.read_bytes())
+    (object_file,) = tmp_path.glob("*/advance.*.o")
+    data = bytearray(object_file.read_bytes())
     data[len(data) // 2] ^= 1
-    stored.write_bytes(data)
+    object_file.write_bytes(data)
     assert run_process(tmp_path) == ("True", state)
     assert run_process(tmp_path) == ("False", state), "a damaged file is replaced"
 

@@ -50,14 +50,15 @@ def test_coil_lag_is_3_dB_down_where_it_should(tau: float) -> None:
     p = EASY.replace({"coil_lag.time": tau}).build_record()[0]
     t = (np.arange(round(40 * tau / H)) + 0.5) * H  # the current is constant over a step: taken at its middle
     out = follow(coil_lag, np.sin(t / tau), Lag(), p)
-    settled = t > 10 * tau
-    np.testing.assert_allclose(out[settled], np.sin(t / tau - np.pi / 4)[settled] / np.sqrt(2), atol=2e-3)
+    is_settled = t > 10 * tau
+    np.testing.assert_allclose(out[is_settled], np.sin(t / tau - np.pi / 4)[is_settled] / np.sqrt(2), atol=2e-3)
 
 
 def test_current_noise_is_hum_and_the_random_number_of_the_cycle() -> None:
     p = WHOLE.replace({"current_noise.white": 1e-4, "current_noise.hum": 3e-4}).build_record()[0]  # 400 Hz
-    seen = [current_noise(1e-3, REST, Input(noise=noise, t=t), p) for noise, t in ((2.0, 0.0), (-1.0, 0.25 / 400.0))]
-    assert seen == pytest.approx([1e-3 + 2e-4, 1e-3 - 1e-4 + 3e-4], rel=1e-9)
+    currents = [current_noise(1e-3, REST, Input(noise=noise, t=t), p)
+                for noise, t in ((2.0, 0.0), (-1.0, 0.25 / 400.0))]
+    assert currents == pytest.approx([1e-3 + 2e-4, 1e-3 - 1e-4 + 3e-4], rel=1e-9)
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 5])
@@ -168,15 +169,15 @@ def _moved(flat, spool, load, record, h, out):
 def test_compressibility_resonates_where_it_should_and_the_step_damps_nothing(h: float) -> None:
     """w = AJ/sqrt(V/4B MJ), 123 Hz; damping from CJ and the edges, within 3 % at 50 us."""
     model = EASY.replace({"compressibility.coefficient": 1e-9})
-    v, stored = model.values, 0.25 * 1.5e-4 * 1e-9
+    v, capacitance = model.values, 0.25 * 1.5e-4 * 1e-9
     out = np.empty((2, round(0.05 / h)))
     start = model.build_flat_state()
     start[State._fields.index("jack_speed")] = 0.01
     run = interpret_function(_moved, model.kind.bind_functions(model.effects))
     run(start, *np.zeros((2, out.shape[1])), model.build_record(), h, out)
     matrix = np.array([[-v["jack.damping"] / v["jack.mass"], v["jack.area"] / v["jack.mass"]],
-                       [-v["jack.area"] / stored, -(v["valve.flow_gain"] / v["valve.pressure_gain"]
-                                                    + v["jack.leakage"]) / stored]])
+                       [-v["jack.area"] / capacitance, -(v["valve.flow_gain"] / v["valve.pressure_gain"]
+                                                         + v["jack.leakage"]) / capacitance]])
     root = np.linalg.eigvals(matrix)[0]
     t, (_, p12) = np.arange(1, out.shape[1] + 1) * h, out
     peaks = [i for i in range(1, len(p12) - 1) if abs(p12[i]) >= abs(p12[i - 1]) and abs(p12[i]) > abs(p12[i + 1])]
@@ -260,13 +261,13 @@ def test_constant_load_equals_the_load_of_the_command() -> None:
 @pytest.mark.parametrize("signal", ["step", "ramp", "sine"])
 def test_sensor_lag_is_a_first_order_lag(tau: float, signal: str) -> None:
     t, w = np.arange(1, 4001) * H, 2 * np.pi * 40
-    x, expected = {
+    x, response = {
         "step": (np.full_like(t, 1e-3), 1e-3 * (1 - np.exp(-(t - H / 2) / tau))),  # it rises within the first step
         "ramp": (t, t - tau * (1 - np.exp(-t / tau))),
         "sine": (np.sin(w * t), (np.sin(w * t) - w * tau * (np.cos(w * t) - np.exp(-t / tau))) / (1 + (w * tau) ** 2)),
     }[signal]
     sensed = follow(sensor_lag, x, Lag(), WHOLE.replace({"sensor_lag.time": tau}).build_record()[0])
-    np.testing.assert_allclose(sensed, expected, atol=2e-4 * np.abs(x).max())
+    np.testing.assert_allclose(sensed, response, atol=2e-4 * np.abs(x).max())
 
 
 @pytest.mark.parametrize("fast", [True, False])
@@ -295,10 +296,10 @@ def test_readings_are_whole_steps_and_their_error_is_evenly_spread() -> None:
 def test_the_rigs_own_firmware_limits_the_rate_too() -> None:
     """Frame by frame, from the first active cycle; and anew after each activation."""
     desk = FirmwareDesk(Model().replace({"command_rate_limit.rate": 0.1}))
-    wanted = [0.0, *(0.1e-3 * k for k in range(1, 6))]
+    ramp = [0.0, *(0.1e-3 * k for k in range(1, 6))]
     for _ in range(2):
         drives = [desk.cycle(CIA408.ladder[-1], demand) for demand in (0.0, *[5e-3] * 5)]
-        assert [drive and drive.current for drive in drives] == pytest.approx([3.8 * x for x in wanted], abs=1e-8)
+        assert [drive and drive.current for drive in drives] == pytest.approx([3.8 * x for x in ramp], abs=1e-8)
         desk.cycle(0)
 
 
@@ -326,7 +327,7 @@ def test_a_mass_on_the_ram_has_the_antiresonance_and_the_resonance_of_two_masses
     mass, f, ratio, push, h = 60.0, 60.0, 0.03, 500.0, 4e-5
     model = SMOOTH.replace({"structural_resonance.mass": mass, "structural_resonance.frequency": f,
                             "structural_resonance.damping_ratio": ratio})
-    p, moved = model.build_record()[0], interpret_function(ram, model.kind.bind_functions(model.effects))
+    p, move_ram = model.build_record()[0], interpret_function(ram, model.kind.bind_functions(model.effects))
     k, resonance = compute_coefficients(p, h), f * np.sqrt(1.0 + mass / p.jack.mass)
     k = k._replace(jack_coupled=k.jack_free)  # as the oil has no part in it
     sizes = []
@@ -334,15 +335,15 @@ def test_a_mass_on_the_ram_has_the_antiresonance_and_the_resonance_of_two_masses
         (s, m), w, t = model.build_start(), 2.0 * np.pi * hertz, h * np.arange(1, round(0.45 / h) + 1)
         x = np.empty(len(t))
         for i, force in enumerate(push * np.cos(w * (t - 0.5 * h))):  # at mid step; a cosine gives the ram no drift
-            x[i], v, _, m = moved(s, m, Input(h=h), p, k, Line(0.0, 0.0, 0.0, 0.0), force)
+            x[i], v, _, m = move_ram(s, m, Input(h=h), p, k, Line(0.0, 0.0, 0.0, 0.0), force)
             s = s._replace(jack_position=x[i], jack_speed=v)
         last = slice(-round(0.1 / h), None)  # the start has died away
         waves = np.exp(1j * w * t[last])
         (real, imaginary, _), *_ = np.linalg.lstsq(np.c_[waves.real, -waves.imag, np.ones(len(waves))], x[last])
         spring, damper = mass * (2.0 * np.pi * f) ** 2, 2.0 * ratio * mass * 2.0 * np.pi * f
         link = spring + 1j * w * damper
-        held = -w**2 * mass * link / (link - w**2 * mass)  # force on the ram for each metre that it moves
-        exact = -push / (-w**2 * p.jack.mass + 1j * w * p.jack.damping + held)
+        stiffness = -w**2 * mass * link / (link - w**2 * mass)  # force on the ram for each metre that it moves
+        exact = -push / (-w**2 * p.jack.mass + 1j * w * p.jack.damping + stiffness)
         assert abs(real + 1j * imaginary - exact) < 0.03 * abs(exact), hertz
         sizes.append(abs(exact) * w**2)  # of the acceleration: what the mass alone does not change
     assert sizes[1] < 0.2 * sizes[0] and sizes[2] > 3.0 * max(sizes[0], sizes[3])
@@ -389,12 +390,12 @@ def test_a_blocked_nozzle_is_half_the_difference_of_the_openings(b: float, x: fl
 def test_worn_lands_leak_in_proportion_to_the_pressure(speed: float) -> None:
     """GQ XS - GQ/GP P12 = AJ v + (CLK + K) P12 with K = w (c^3 - c0^3)/(12 mu L)."""
     model, p, line = build("land_clearance.clearance", 3e-5)
-    worn = land_clearance(line, State(), Input(), p)
-    pressure = worn.offset - worn.slope * speed
+    worn_line = land_clearance(line, State(), Input(), p)
+    pressure = worn_line.offset - worn_line.slope * speed
     leak = 0.013 * (3e-5**3 - 6e-6**3) / (12.0 * 0.015 * 1e-3)
     gq, gp = model["valve.flow_gain"], model["valve.pressure_gain"]
-    needed = model["jack.area"] * speed + (model["jack.leakage"] + leak + gq / gp) * pressure
-    assert needed == pytest.approx(gq * 2e-5, rel=1e-9)
+    flow = model["jack.area"] * speed + (model["jack.leakage"] + leak + gq / gp) * pressure
+    assert flow == pytest.approx(gq * 2e-5, rel=1e-9)
 
 
 def test_rounded_edges_are_a_bridge_of_two_openings() -> None:

@@ -138,9 +138,9 @@ def test_more_of_it_shows_more(name: str) -> None:
 def test_visible_at_its_largest_start(name: str) -> None:
     """In closed loop over the preflight, without the phase of the spool's stick-slip, above the noise of one sensor."""
     with_it, without = (simulate(m, PREFLIGHT, steps=FEW) for m in (QUIET_SPOOL.replace(largest(name)), QUIET_SPOOL))
-    seen = [np.sqrt(((a - b) ** 2).mean()) / noise for a, b, noise in (
+    levels = [np.sqrt(((a - b) ** 2).mean()) / noise for a, b, noise in (
         (with_it.xj, without.xj, 2e-6), (with_it.p12, without.p12, 2e4), (with_it.xs, without.xs, 1e-6))]
-    assert max(seen) > 1.0
+    assert max(levels) > 1.0
 
 
 @pytest.mark.parametrize("name", CANONICAL)
@@ -249,8 +249,8 @@ def test_an_effect_without_a_hint_starts_where_it_shows(file: Path, text: str, n
     starts = find_starts(CATALOGUE[name], PREFLIGHT)
     assert all(tuple(start) == CATALOGUE[name].fitted for start in starts)
     upwards = [start for start in starts if start[sized] > 0.0 and start.get("cogging.length", 1e-3) == 1e-3]
-    shown = compute_levels(compute_changes(CATALOGUE[name], upwards, PREFLIGHT)).max(axis=1)
-    assert shown == pytest.approx([3.0, 30.0, 300.0], rel=0.5)
+    levels = compute_levels(compute_changes(CATALOGUE[name], upwards, PREFLIGHT)).max(axis=1)
+    assert levels == pytest.approx([3.0, 30.0, 300.0], rel=0.5)
     assert {start["cogging.length"] for start in starts} == {1e-3, 4e-4, 2.5e-3} if name == "cogging" else True
 
 
@@ -258,11 +258,11 @@ def test_a_shared_effect_starts_where_another_plant_shows_it() -> None:
     """Microamperes are a null bias of a servovalve and not of a motor; the EHA keeps its own sizes."""
     command = build_profile(find_plant("ema").profile).command
     before = CATALOGUE["constant_load"].starts
-    found = ensure_starts("constant_load", command, plant="ema")
-    shown = compute_levels(compute_changes(found, found.starts, command, plant="ema"), "ema").max(axis=1)
-    assert shown.min() > 1.0 and (shown < 10.0).any() and (shown > 100.0).any()
-    assert {next(iter(start.values())) > 0.0 for start in found.starts} == {True, False}
-    assert ensure_starts("constant_load", command, plant="ema") is found
+    effect = ensure_starts("constant_load", command, plant="ema")
+    levels = compute_levels(compute_changes(effect, effect.starts, command, plant="ema"), "ema").max(axis=1)
+    assert levels.min() > 1.0 and (levels < 10.0).any() and (levels > 100.0).any()
+    assert {next(iter(start.values())) > 0.0 for start in effect.starts} == {True, False}
+    assert ensure_starts("constant_load", command, plant="ema") is effect
     assert ensure_starts("constant_load", PREFLIGHT).starts == before
 
 
@@ -305,8 +305,8 @@ def test_the_trial_of_an_unsound_effect(file: Path) -> None:
 
 def test_the_trial_of_an_effect_that_does_not_show(file: Path) -> None:
     load_text(file, COGGING)
-    found = check_effect("cogging", np.zeros(100))
-    assert found.faults == ("no size of it changes anything on this command",) and not found.visible
+    report = check_effect("cogging", np.zeros(100))
+    assert report.faults == ("no size of it changes anything on this command",) and not report.visible
 
 
 def test_the_catalogue_is_told_for_machines() -> None:

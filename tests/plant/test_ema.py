@@ -73,8 +73,8 @@ def test_two_masses_on_the_screw_swing_at_their_frequency_and_keep_their_energy(
     stretch = s[:, 1] - s[:, 3]
     up = np.flatnonzero((stretch[:-1] < 0.0) & (stretch[1:] >= 0.0))
     times = up + stretch[up] / (stretch[up] - stretch[up + 1])
-    found = 2.0 * pi / (np.diff(times).mean() * 1e-5)
-    assert found == pytest.approx(np.sqrt(STIFF * (1.0 / MOTOR + 1.0 / MASS)), rel=2e-5)
+    frequency = 2.0 * pi / (np.diff(times).mean() * 1e-5)
+    assert frequency == pytest.approx(np.sqrt(STIFF * (1.0 / MOTOR + 1.0 / MASS)), rel=2e-5)
     energy = 0.5 * (MOTOR * s[:, 2]**2 + MASS * s[:, 4]**2 + STIFF * stretch**2)
     assert np.abs(energy / energy[0] - 1.0).max() < 1e-4
 
@@ -100,9 +100,9 @@ def test_stiction_breaks_at_its_level_and_sliding_needs_the_dynamic_one() -> Non
 def test_the_surface_waits_for_the_motor_by_the_backlash_and_the_wind_up_of_friction(width: float) -> None:
     p = change_parameters(**{"screw.backlash": width, "surface.stiction": 0.0})
     s = run(p, np.sin(2.0 * pi * 0.25 * 2e-5 * np.arange(200_000)), 2e-5)
-    lost, slides = np.abs(s[:, 1] - s[:, 3]), s[:, 4] != 0.0
+    lost_motion, slides = np.abs(s[:, 1] - s[:, 3]), s[:, 4] != 0.0
     force = 100.0 + p.surface.damping * np.median(np.abs(s[slides, 4]))
-    assert np.median(lost[slides]) == pytest.approx(0.5 * width + force / STIFF, rel=0.02)  # apart from impacts
+    assert np.median(lost_motion[slides]) == pytest.approx(0.5 * width + force / STIFF, rel=0.02)  # apart from impacts
 
 
 def test_the_smooth_model_agrees_with_an_independent_solver() -> None:

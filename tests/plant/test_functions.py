@@ -65,17 +65,17 @@ def test_functions_of_arrays() -> None:
     assert functions.exp_of(x).tolist() == [functions.exp(number) for number in x.tolist()]
 
 
-@pytest.mark.parametrize(("name", "x", "expected"), [
+@pytest.mark.parametrize(("name", "x", "end_value"), [
     ("exp", math.inf, math.inf), ("exp", -math.inf, 0.0), ("exp", 710.0, math.inf), ("exp", -746.0, 0.0),
     ("exp", 0.0, 1.0), ("exp", -745.0, 5e-324), ("log", 0.0, -math.inf), ("log", -1.0, math.nan),
     ("log", math.inf, math.inf), ("log", 1.0, 0.0), ("sin", 0.0, 0.0), ("sin", math.inf, math.nan),
     ("cos", -math.inf, math.nan), ("cos", 0.0, 1.0), ("tan", 1e300, math.nan), ("tanh", math.inf, 1.0),
     ("tanh", -1e300, -1.0), ("atan", math.inf, math.pi / 2.0), ("atan", -math.inf, -math.pi / 2.0), ("atan", 0.0, 0.0),
     *((name, math.nan, math.nan) for name in CASES)])
-def test_at_the_ends(name: str, x: float, expected: float) -> None:
+def test_at_the_ends(name: str, x: float, end_value: float) -> None:
     with np.errstate(all="raise"):
         y = getattr(functions, name)(x)
-    assert y == expected or (math.isnan(y) and math.isnan(expected))
+    assert y == end_value or (math.isnan(y) and math.isnan(end_value))
 
 
 def by_name(x: float) -> float:
@@ -100,7 +100,7 @@ PI, PD = PID._replace(derivative_gain=0.0), PID._replace(integral_gain=0.0)
 P = PD._replace(derivative_gain=0.0)
 
 
-@pytest.mark.parametrize(("law", "rows", "expected"), [
+@pytest.mark.parametrize(("law", "rows", "currents"), [
     # 4 A/m on the error, demand minus position; 8 mA at most, either way
     (P, [(1e-3, 0.0), (1e-3, 0.25e-3), (0.0, 0.5e-3), (5e-3, 0.0), (-5e-3, 0.0), (2e-3, 0.0)],
      [4e-3, 3e-3, -2e-3, 8e-3, -8e-3, 8e-3]),
@@ -114,13 +114,13 @@ P = PD._replace(derivative_gain=0.0)
     (PI, [(1e-3, 0.0), *[(5e-3, 0.0)] * 1000, (1e-3, 0.0), (-1e-3, 0.0)],
      [4.05e-3, *[8e-3] * 1000, 4.1e-3, -4e-3 + 0.05e-3]),
 ], ids=["proportional", "derivative", "integral", "all three", "no wind-up"])
-def test_law(law: Controller, rows: list[tuple[float, float]], expected: list[float]) -> None:
+def test_law(law: Controller, rows: list[tuple[float, float]], currents: list[float]) -> None:
     """Currents, A, for rows of demand and position, m."""
     loop, out = Loop(), []
     for demand, position in rows:
         current, loop = compute_current(loop, demand, position, law)
         out.append(current)
-    assert out == pytest.approx(expected, abs=1e-15)
+    assert out == pytest.approx(currents, abs=1e-15)
 
 
 def test_the_limit_does_not_stop_an_integral_that_comes_back() -> None:

@@ -130,10 +130,10 @@ def test_runs_go_to_the_kernel_with_the_fewest_effects(catalogue: Lanes, monkeyp
     assert len(list_kernel_variants(QUIET.with_effects(EFFECTS[:3]))) == 1
     at_work = [{}, *(start(effect, 0) for effect in ("null_bias", "stribeck", "rod_backlash", "orifice_root")), {}]
     values = np.vstack([with_effects(catalogue, changes) for changes in at_work])
-    shared = catalogue.replay(values, CURRENT, FORCE)
+    outputs = catalogue.replay(values, CURRENT, FORCE)
     monkeypatch.setattr(lanes_module, "FEW", 99)
     whole = Lanes(catalogue.model, catalogue.names, catalogue.steps)
-    assert (shared == whole.replay(values, CURRENT, FORCE)).all()
+    assert (outputs == whole.replay(values, CURRENT, FORCE)).all()
 
 
 def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth_while(
@@ -143,15 +143,15 @@ def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth
     values = np.vstack([with_effects(catalogue, {n: v for name in kind for n, v in start(name, which).items()})
                         for kind in kinds for which in (0, -1)] * 4)
     monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
-    without = catalogue.replay(values, CURRENT, FORCE)
+    outputs = catalogue.replay(values, CURRENT, FORCE)
     assert {len(variant.model.effects) for variant, _ in catalogue._assign_runs(values, 1)} == {len(EFFECTS)}
     monkeypatch.setattr(kernel_use, "WORTH_LOADING", 0.0)
     monkeypatch.setattr(kernel_use, "WORTH_COMPILING", 0.0)
     monkeypatch.setattr(lanes_module, "KERNEL_USE", KernelUse())
-    shared = catalogue._assign_runs(values, 1)
+    assignments = catalogue._assign_runs(values, 1)
     assert {frozenset(variant.model.effects) & {"coil_lag", "viscosity_drift", "stribeck"}
-            for variant, _ in shared} == {frozenset({"coil_lag"})}
-    assert (catalogue.replay(values, CURRENT, FORCE) == without).all()
+            for variant, _ in assignments} == {frozenset({"coil_lag"})}
+    assert (catalogue.replay(values, CURRENT, FORCE) == outputs).all()
 
 
 def test_an_effect_of_a_user_with_a_memory(tmp_path: Path) -> None:
@@ -179,9 +179,9 @@ def test_a_start_from_a_measured_position_and_the_pull_to_it() -> None:
 
 def test_threads_do_not_matter() -> None:
     values = np.linspace(5.0, 40.0, 70)[:, None]
-    alone, shared = (Lanes(QUIET, ["spool.static_friction"], 10, workers).replay(values, CURRENT, FORCE)
-                     for workers in (1, 3))
-    assert (alone == shared).all() and len(np.unique(alone[:, -1, 0])) > 50
+    serial_runs, parallel_runs = (Lanes(QUIET, ["spool.static_friction"], 10, workers).replay(values, CURRENT, FORCE)
+                                  for workers in (1, 3))
+    assert (serial_runs == parallel_runs).all() and len(np.unique(serial_runs[:, -1, 0])) > 50
 
 
 def test_runs_of_side_by_side_fits_share_blocks_and_keep_their_bits(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +199,7 @@ def test_runs_of_side_by_side_fits_share_blocks_and_keep_their_bits(monkeypatch:
     alone = [replay(task) for task in tasks]
     blocks = []
     build = lanes_module.build_blocks
-    monkeypatch.setattr(lanes_module, "build_blocks", lambda *given: blocks.append(build(*given)) or blocks[-1])
+    monkeypatch.setattr(lanes_module, "build_blocks", lambda *arguments: blocks.append(build(*arguments)) or blocks[-1])
     for one, other in zip(alone, map_together(replay, tasks, 2), strict=True):
         assert np.array_equal(one, other)
     assert sorted(len(each) for each in blocks) == [1, 2]
@@ -264,8 +264,8 @@ def test_the_transducer_moves_along_where_the_ram_is_pulled() -> None:
     before, m = model.build_start()
     after, m = pull(before, m, 0.5, before.sensed + 2e-5, 0.0, p)
     after = show(after, m, p)
-    moved = (after.jack_position - before.jack_position, after.sensed - before.sensed)
-    assert moved == pytest.approx((1e-5, 1e-5))
+    shifts = (after.jack_position - before.jack_position, after.sensed - before.sensed)
+    assert shifts == pytest.approx((1e-5, 1e-5))
 
 
 PREFLIGHT = load_sequence("preflight").main_profile().command

@@ -139,10 +139,10 @@ CHANGES = {
 @given(st.fixed_dictionaries({}, optional=CHANGES), st.text(st.characters(codec="utf-8"), min_size=1, max_size=12))
 @settings(max_examples=40, deadline=None)
 def test_model_file_round_trip(tmp_path_factory: pytest.TempPathFactory, changes: dict[str, object], name: str) -> None:
-    path, changed = tmp_path_factory.getbasetemp() / "model.toml", Model().replace(changes)
-    path.write_text(Model(name, changed.values, changed.effects).to_toml(), encoding="utf-8", newline="")
+    path, model = tmp_path_factory.getbasetemp() / "model.toml", Model().replace(changes)
+    path.write_text(Model(name, model.values, model.effects).to_toml(), encoding="utf-8", newline="")
     back = load_model(path)
-    assert (back.name, back.effects, dict(back.values)) == (name, changed.effects, dict(changed.values))
+    assert (back.name, back.effects, dict(back.values)) == (name, model.effects, dict(model.values))
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -233,15 +233,15 @@ def test_schroeder_phases_keep_the_crest_low() -> None:
     assert schroeder < 2.0 < 7.0 < aligned
 
 
-@pytest.mark.parametrize(("t", "values", "period", "expected"), [
+@pytest.mark.parametrize(("t", "values", "period", "samples"), [
     ([0.0, 0.004, 0.005], [0.0, 4.0, 9.0], 0.002, [0, 2, 4]), ([5.0], [3.0], 0.002, [3.0]),
     ([0.0, 0.004, 0.005], [0.0, 4.0, 9.0], 0.001, [0, 1, 2, 3, 4, 9])])
 def test_breakpoints_are_joined_by_lines_and_one_row_is_one_cycle(t: list[float], values: list[float], period: float,
-                                                                 expected: list[float]) -> None:
-    assert resample_on_cycles(np.array(t), np.array(values), period).tolist() == expected
+                                                                 samples: list[float]) -> None:
+    assert resample_on_cycles(np.array(t), np.array(values), period).tolist() == samples
 
 
-@pytest.mark.parametrize(("make", "key", "expected"), [
+@pytest.mark.parametrize(("make", "key", "expectation"), [
     (lambda: Hold(time=0.0), "time", "above 0 and at most 3600 s, not 0"),
     (lambda: Hold(time=float("nan")), "time", "at most 3600 s, not nan"),
     (lambda: build_profile([Hold(time=0.0105)]), "time", "whole cycles of 0.001 s, not 0.0105"),
@@ -258,6 +258,6 @@ def test_breakpoints_are_joined_by_lines_and_one_row_is_one_cycle(t: list[float]
     (lambda: Points(points=()), "points", "pairs"),
     (lambda: build_profile([Hold(time=1.0, name="a"), Hold(time=1.0, name="a")]), "name", "used once"),
 ])
-def test_an_impossible_segment_is_refused_by_key(make: Callable[[], object], key: str, expected: str) -> None:
+def test_an_impossible_segment_is_refused_by_key(make: Callable[[], object], key: str, expectation: str) -> None:
     line = catch_refusal(make)
-    assert f"{key}: expected" in line and expected in line
+    assert f"{key}: expected" in line and expectation in line

@@ -51,8 +51,8 @@ def follow(model: Model, currents: np.ndarray) -> np.ndarray:
     (20e-3, 0.0), (20e-3, 5.0), (20e-3, 20.0), (20e-3, 35.0)])
 def test_steady_ramp_error_does_not_depend_on_spool_friction(rate: float, friction: float) -> None:
     run = simulate(SILENT.replace(spool(friction)), ramp(rate, 4.0 if rate < 1e-3 else 1.8))
-    expected = rate / KPOS + DROOP * (FDJ + V["jack.damping"] * rate)
-    assert (run.com - run.xj)[1000:].mean() == pytest.approx(expected, rel=0.01)
+    error = rate / KPOS + DROOP * (FDJ + V["jack.damping"] * rate)
+    assert (run.com - run.xj)[1000:].mean() == pytest.approx(error, rel=0.01)
 
 
 @pytest.mark.parametrize("friction", [5.0, 10.0, 20.0, 40.0])
@@ -64,8 +64,8 @@ def test_limit_cycle_of_the_stuck_spool(friction: float) -> None:
 @pytest.mark.parametrize("friction", [5.0, 35.0])
 def test_break_away_error(friction: float) -> None:
     run = simulate(SILENT.replace(spool(friction)), ramp(20e-6, 10.0))
-    moved = int(np.argmax(run.xs != 0.0))
-    assert (run.com - run.xj)[moved] == pytest.approx(friction * KF / (GPF * ASV * GM * GAP), rel=0.01)
+    row = int(np.argmax(run.xs != 0.0))
+    assert (run.com - run.xj)[row] == pytest.approx(friction * KF / (GPF * ASV * GM * GAP), rel=0.01)
 
 
 def test_spool_hysteresis() -> None:
@@ -247,8 +247,8 @@ def test_against_an_independent_solver(model: Model, command: np.ndarray, load: 
     runs["largest"], runs["fine"] = runs[""], simulate(model, command, load, steps=2000 if len(command) < 99 else 100)
     for which, most in limits.items():
         kind, _, column = which.rpartition(" ")
-        left = getattr(runs[kind], column) - truth[column]
-        assert (np.abs(left).max() if kind == "largest" else rms(left)) < most, which
+        residual = getattr(runs[kind], column) - truth[column]
+        assert (np.abs(residual).max() if kind == "largest" else rms(residual)) < most, which
 
 
 def test_rig_simulate_follows_an_independent_simulation_at_1_us(tmp_path: Path) -> None:

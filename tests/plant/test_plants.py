@@ -87,9 +87,9 @@ def test_lanes_are_single_runs(model: Model) -> None:
     out = Lanes(quiet, ()).closed_loop(np.empty((3, 0)), com, np.zeros(len(com)))
     assert all(np.array_equal(lane, whole) for lane in out)
     drive = getattr(run, quiet.kind.signals.drive.name)
-    replayed = Lanes(quiet, ()).replay(np.empty((1, 0)), drive, np.zeros(len(com)))[0]
+    replay_outputs = Lanes(quiet, ()).replay(np.empty((1, 0)), drive, np.zeros(len(com)))[0]
     outputs = np.column_stack([getattr(run, s.name) for s in quiet.kind.signals.outputs])
-    assert np.array_equal(replayed, outputs) or model.effects  # an effect on a reading acts on the controller too
+    assert np.array_equal(replay_outputs, outputs) or model.effects  # an effect on a reading acts on the controller too
 
 
 def test_effects_at_their_off_values_change_nothing(model: Model) -> None:
@@ -113,8 +113,8 @@ def test_a_model_file_runs_its_plant_only_with_trust(tmp_path: Path) -> None:
     (tmp_path / "new_plant.py").write_text(TEXT)
     (tmp_path / "unit.toml").write_text('plant = "new_plant.py"\n[motor]\nresistance = 3.0\n')
     words = ("simulate", "--model", tmp_path / "unit.toml", "--out", tmp_path / "s.csv")
-    refused = rig(*words)
-    assert refused.status == 2 and "--trust" in refused.err and not (tmp_path / "s.csv").exists()
+    refusal = rig(*words)
+    assert refusal.status == 2 and "--trust" in refusal.err and not (tmp_path / "s.csv").exists()
     assert rig(*words, "--trust").status == 0
     assert (tmp_path / "s.csv").read_text().startswith("t,demand,voltage,angle,current,torque\n")
 
@@ -209,7 +209,7 @@ def test_fields_that_do_not_move_along_fail_the_check(moves: str, tmp_path: Path
         "(s.speed + speed))", "(s.speed + speed), s.motor + h * ratio * speed)").replace(
         '("angle",)', moves)
     model = load_model(write_file(tmp_path / "shaft.py", text))
-    moves = next(found for found in check_behaviour(model) if found.check == "moves")
+    moves = next(finding for finding in check_behaviour(model) if finding.check == "moves")
     assert not moves.passed
 
 
@@ -220,8 +220,8 @@ def test_a_stiff_plant_without_tolerances_is_explained(tmp_path: Path) -> None:
         "* s.speed - p.motor.resistance * s.current)) / inductance")
     file, run = write_file(tmp_path / "stiff.py", text), tmp_path / "run.csv"
     rig("simulate", "--model", file, "--set", "dry_friction.torque=0.4", "--out", run)
-    found = rig("explain", run, "--model", file, "--json").json
-    assert (found["verdict"], found["effects"]) == ("EXPLAINED", ["dry_friction"])
+    answer = rig("explain", run, "--model", file, "--json").json
+    assert (answer["verdict"], answer["effects"]) == ("EXPLAINED", ["dry_friction"])
 
 
 def test_a_plant_that_diverges_is_refused_with_signal_and_time(tmp_path: Path) -> None:
@@ -263,13 +263,13 @@ SPEED = 800.0  # raw
 GENERAL = ("undissolved_air", "flow_delay", "valve_switching", "asymmetric_gain")
 
 
-def build_model(**changed: float) -> Model:
+def build_model(**changes: float) -> Model:
     """The bare integrator without the steps of its position sensor, with some parameters changed.
 
     It has the general effects, so that one kernel serves all.
     """
     return load_model("ehs").with_effects(GENERAL).replace({"quantisation.lsb": 0.0}
-                                     | {name.replace("__", "."): value for name, value in changed.items()})
+                                     | {name.replace("__", "."): value for name, value in changes.items()})
 
 
 def replay(model: Model, drive: np.ndarray, load: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -291,22 +291,22 @@ def test_the_pressure_of_a_blocked_ram_rises_as_the_air_gives_way(exponent: floa
                         jack__static_friction=1e7, jack__dynamic_friction=1e7)
     drive = np.full(400, 200.0)
     xj, p12 = replay(model, drive)
-    moved = model["pump.displacement"] * 200.0 * CYCLE * (np.arange(400.0) - 1.0).clip(0.0) / volume
-    expected = ATMOSPHERE * {0.0: moved, 1.0: np.exp(moved) - 1.0, 2.0: 1.0 / (1.0 - moved) - 1.0}[exponent]
-    assert expected[-1] > 0.09 * ATMOSPHERE and np.abs(xj).max() == 0.0
-    np.testing.assert_allclose(p12, expected, rtol=2e-3, atol=5.0)
+    share = model["pump.displacement"] * 200.0 * CYCLE * (np.arange(400.0) - 1.0).clip(0.0) / volume
+    pressure = ATMOSPHERE * {0.0: share, 1.0: np.exp(share) - 1.0, 2.0: 1.0 / (1.0 - share) - 1.0}[exponent]
+    assert pressure[-1] > 0.09 * ATMOSPHERE and np.abs(xj).max() == 0.0
+    np.testing.assert_allclose(p12, pressure, rtol=2e-3, atol=5.0)
 
 
 def test_a_delayed_flow_follows_erlangs_distribution() -> None:
     """Four lags of tau/4: 1 - exp(-k) (1 + k + k^2/2 + k^3/6), k = 4 t/tau; without delay exactly the step."""
     h, tau = 1e-5, 0.02
     (p,), (none,) = (build_model(flow_delay__time=time).build_record() for time in (tau, 0.0))
-    shown = [(0.0, Cascade())]
+    flows = [(0.0, Cascade())]
     for _ in range(6000):
-        shown.append(flow_delay(1.0, shown[-1][1], State(), Input(h=h), p))
+        flows.append(flow_delay(1.0, flows[-1][1], State(), Input(h=h), p))
     k = 4.0 * h * np.arange(1, 6001) / tau
-    expected = 1.0 - np.exp(-k) * sum(k**n / factorial(n) for n in range(4))
-    np.testing.assert_allclose([y for y, _ in shown[1:]], expected, atol=1e-3)
+    response = 1.0 - np.exp(-k) * sum(k**n / factorial(n) for n in range(4))
+    np.testing.assert_allclose([y for y, _ in flows[1:]], response, atol=1e-3)
     assert flow_delay(0.7, Cascade(0.1, 0.2, 0.3, 0.4), State(), Input(h=h), none)[0] == 0.7
 
 
@@ -319,8 +319,8 @@ def test_a_switching_valve_stops_the_flow_at_each_reversal_and_not_at_the_start(
 
 def test_an_asymmetric_gain_answers_a_negative_error_less() -> None:
     model = build_model(asymmetric_gain__retraction=-0.3)
-    found = compute_answers(model, np.array([1e-3, -1e-3, 0.0]), np.zeros(3))
-    np.testing.assert_allclose(found / model["controller.proportional_gain"], [1e-3, -0.7e-3, 0.0], rtol=1e-12)
+    answers = compute_answers(model, np.array([1e-3, -1e-3, 0.0]), np.zeros(3))
+    np.testing.assert_allclose(answers / model["controller.proportional_gain"], [1e-3, -0.7e-3, 0.0], rtol=1e-12)
 
 
 def test_a_check_valve_locks_the_ram_while_the_motor_is_slow() -> None:
@@ -348,8 +348,8 @@ def test_the_flow_under_measured_pressures(out: float) -> None:
     pressure = 1e6 + 2e3 * np.arange(300.0)  # of P12
     xj, p12 = replay(model, np.full(300, out * SPEED), out * pressure * model["jack.area"])
     flow = model["pump.displacement"] * SPEED / area - volume / ATMOSPHERE * 2e3 / CYCLE
-    expected = out * (flow - leakage / area**2 * pressure) / model["jack.area"]
-    np.testing.assert_allclose(np.diff(xj[100:]) / CYCLE, expected[100:-1], rtol=1e-3)
+    ram_speed = out * (flow - leakage / area**2 * pressure) / model["jack.area"]
+    np.testing.assert_allclose(np.diff(xj[100:]) / CYCLE, ram_speed[100:-1], rtol=1e-3)
     np.testing.assert_allclose(p12[1:], out * pressure[:-1], rtol=1e-9)
 
 
@@ -372,11 +372,11 @@ def test_measured_pressures_move_the_ram_and_are_not_predicted_from_themselves()
     lanes = Lanes(model, names, 20)
     driven = lanes.replay(values, drive, 0.0 * rows, chambers=chambers)
     assert (driven[..., 1:] == lanes.replay(values, drive, 0.0 * rows)[..., 1:]).all()
-    given = model.replace({"pump.pressure_given": 1.0, "undissolved_air.preload": 0.0})
+    flow_model = model.replace({"pump.pressure_given": 1.0, "undissolved_air.preload": 0.0})
     for (delay, _), run in zip(values, driven, strict=True):
         force = compute_pressure_force(dict(model.values) | {names[0]: delay}, chambers, drive, CYCLE)
-        own = Lanes(given, names, 20).replay(np.array([[delay, 0.0]]), drive, force)[0]
-        assert (run[:, 0] == own[:, 0]).all()
+        flow_run = Lanes(flow_model, names, 20).replay(np.array([[delay, 0.0]]), drive, force)[0]
+        assert (run[:, 0] == flow_run[:, 0]).all()
 
 
 def test_the_loggers_columns() -> None:
@@ -417,9 +417,9 @@ def test_general_effects_suit_every_plant_and_act_and_are_searched_in_this_one(n
     assert (off == without).all() and np.isfinite(on).all() and (on != without).any()
 
 
-def speeds(**changed: float) -> tuple[float, float]:
+def speeds(**changes: float) -> tuple[float, float]:
     """The ram's speed forwards at 1000 units of motor speed, and backwards, m/s."""
-    xj, _ = replay(build_model(**changed), np.r_[np.full(300, 1000.0), np.full(400, -1000.0)])
+    xj, _ = replay(build_model(**changes), np.r_[np.full(300, 1000.0), np.full(400, -1000.0)])
     return (xj[290] - xj[190]) / 0.1, (xj[690] - xj[590]) / 0.1
 
 
@@ -450,9 +450,9 @@ def test_both_close_on_a_simulation(changes: dict[str, float]) -> None:
     x, v = compute_flow_balance(model, run.xs, run.p12, 0.0)
     assert np.abs(run.xj - x).max() < 20e-6  # m, over 13.5 s: straight lines between the samples
     takes, _, dynamic = compute_force_balance(model, run.xj, v, run.p12, run.load)
-    moving = (np.abs(np.gradient(v, 1e-3)) < 1.0) & (np.abs(v) > 2e-3)
-    left = run.p12 - (takes + np.sign(v) * dynamic) / AJ
-    assert np.sqrt(np.mean(left[moving] ** 2)) < 1e4  # Pa: half the transducer's noise
+    is_moving = (np.abs(np.gradient(v, 1e-3)) < 1.0) & (np.abs(v) > 2e-3)
+    residual = run.p12 - (takes + np.sign(v) * dynamic) / AJ
+    assert np.sqrt(np.mean(residual[is_moving] ** 2)) < 1e4  # Pa: half the transducer's noise
 
 
 def test_the_laws_of_effects_take_part() -> None:

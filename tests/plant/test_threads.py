@@ -25,34 +25,34 @@ def test_answers_come_in_the_order_of_the_questions_and_an_error_reaches_who_ask
 
 def test_an_error_leaves_what_is_still_at_work() -> None:
     """Ctrl-C answers at once: work that has begun goes on by itself, work that has not is dropped."""
-    begun, go_on, done = threading.Event(), threading.Event(), []
+    start, go_on, done = threading.Event(), threading.Event(), []
 
     def do(i: int) -> None:
         if i == 0:
-            begun.wait(120.0)
+            start.wait(120.0)
             raise KeyboardInterrupt
-        begun.set()
+        start.set()
         go_on.wait(120.0)
         done.append(i)
 
     with pytest.raises(KeyboardInterrupt):
         map_in_threads(do, range(40), 2)
     assert len(done) == 0
-    left = [t for t in threading.enumerate() if t.name.startswith(THREAD_NAME)]
+    threads = [t for t in threading.enumerate() if t.name.startswith(THREAD_NAME)]
     go_on.set()
-    for thread in left:
+    for thread in threads:
         thread.join(120.0)
     assert 1 in done
     assert len(done) < 4  # of 39
 
 
 def test_requests_of_side_by_side_tasks_are_met_together_until_each_has_ended() -> None:
-    met: list[list[tuple[int, int]]] = []
+    batches: list[list[tuple[int, int]]] = []
 
     def do(requests: Sequence[tuple[int, int]], workers: int) -> None:
         assert workers == 2
         assert len(map_in_threads(lambda _: threading.get_ident(), range(2), 2)) == 2  # it may use threads
-        met.append(sorted(requests))
+        batches.append(sorted(requests))
 
     def make_requests(task: int) -> int:
         for turn in range(task):
@@ -61,9 +61,9 @@ def test_requests_of_side_by_side_tasks_are_met_together_until_each_has_ended() 
         return task
 
     assert map_together(make_requests, [1, 3, 2], 2) == [1, 3, 2]
-    assert met == [[(0, 1), (0, 2), (0, 3)], [(1, 2), (1, 3)], [(2, 3)]]
-    met.clear()
-    assert map_together(make_requests, [2], 2) == [2] and met == [[(0, 2)], [(1, 2)]]  # nobody to wait for
+    assert batches == [[(0, 1), (0, 2), (0, 3)], [(1, 2), (1, 3)], [(2, 3)]]
+    batches.clear()
+    assert map_together(make_requests, [2], 2) == [2] and batches == [[(0, 2)], [(1, 2)]]  # nobody to wait for
 
 
 @pytest.mark.parametrize("fails_in_task", [True, False])
@@ -79,8 +79,8 @@ def test_no_task_waits_for_one_that_failed(fails_in_task: bool) -> None:
 
     with pytest.raises(AssertionError, match="the task fails" if fails_in_task else "the work fails"):
         map_together(make_requests, range(3), 1)
-    left = [t for t in threading.enumerate() if t.name.startswith(THREAD_NAME)]
-    for thread in left:
+    threads = [t for t in threading.enumerate() if t.name.startswith(THREAD_NAME)]
+    for thread in threads:
         thread.join(120.0)
         assert not thread.is_alive()
 
