@@ -51,9 +51,9 @@ def refuse_other_keys(schema: Any) -> Any:
 @cache
 def build_validator(name: str) -> Any:
     """The validator of one schema without other keys."""
-    closed = {file: refuse_other_keys(schema) for file, schema in load_schemas().items()}
-    registry = Registry().with_resources((file, Resource.from_contents(schema)) for file, schema in closed.items())
-    return Draft202012Validator(closed[name], registry=registry)
+    schemas = {file: refuse_other_keys(schema) for file, schema in load_schemas().items()}
+    registry = Registry().with_resources((file, Resource.from_contents(schema)) for file, schema in schemas.items())
+    return Draft202012Validator(schemas[name], registry=registry)
 
 
 def check_answer(words: Sequence[str], answer: Any) -> None:

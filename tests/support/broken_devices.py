@@ -41,9 +41,9 @@ class Broken:
 
     def receive(self, frame: Frame) -> None:
         self.t_ns = frame.t_ns
-        heard = self.into(frame)
-        if heard is not None:
-            self.node.receive(heard)
+        incoming_frame = self.into(frame)
+        if incoming_frame is not None:
+            self.node.receive(incoming_frame)
 
     def tick(self, t_ns: int) -> None:
         self.t_ns = t_ns
@@ -53,11 +53,11 @@ class Broken:
             self._send(cob_id, data)
 
     def _transmit(self, cob_id: int, data: bytes) -> None:
-        for other, changed, delay in self.out(cob_id, data):
+        for sent_id, payload, delay in self.out(cob_id, data):
             if delay:
-                heapq.heappush(self._held, (self.t_ns + delay, len(self._held), other, changed))
+                heapq.heappush(self._held, (self.t_ns + delay, len(self._held), sent_id, payload))
             else:
-                self._send(other, changed)
+                self._send(sent_id, payload)
 
 
 def examine(patch: Break, node: int = 3, chapters: tuple[str, ...] = (), eds: Path | None = None,
@@ -108,9 +108,9 @@ def change_entries(is_meant: Callable[[Any], bool], **values: Any) -> Break:
 def send_instead(cob_id: int, data: Callable[[bytes], bytes | None],
                  ms: Callable[[bytes], int] = lambda data: 0) -> Break:
     """Frames of this COB-ID carry other data, are left out (None), or come late."""
-    def out(cob: int, sent: bytes) -> list[tuple[int, bytes, int]]:
-        changed = data(sent) if cob == cob_id else sent
-        return [] if changed is None else [(cob, changed, ms(sent) * MS if cob == cob_id else 0)]
+    def out(cob: int, payload: bytes) -> list[tuple[int, bytes, int]]:
+        replacement = data(payload) if cob == cob_id else payload
+        return [] if replacement is None else [(cob, replacement, ms(payload) * MS if cob == cob_id else 0)]
 
     def patch(device: Any) -> None:
         device.broken.out = out

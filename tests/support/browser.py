@@ -77,6 +77,6 @@ def measure_page(page: Path, width: int, script: str = "") -> PageSize:
                          f"></iframe>{TELL_PARENT}", encoding="utf-8")
         dom = call_browser("--allow-file-access-from-files", "--virtual-time-budget=10000",
                            f"--window-size={max(width, 500)},900", "--dump-dom", frame.as_uri())
-    found = re.search(r'<pre id="probe">(.*?)</pre>', dom, re.DOTALL)
-    assert found, f"{page}: the page did not load"
-    return PageSize(**json.loads(unescape(found[1])))
+    match = re.search(r'<pre id="probe">(.*?)</pre>', dom, re.DOTALL)
+    assert match, f"{page}: the page did not load"
+    return PageSize(**json.loads(unescape(match[1])))

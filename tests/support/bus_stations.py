@@ -93,8 +93,8 @@ def stand_nodes(where: str, *nodes: int) -> Iterator[None]:
 
 def wait_for_node(where: str, node: int, seconds: float = 300.0) -> None:
     """Until a node has sent a heartbeat: the plant may compile its model and its cycle before."""
-    heard, end = set[int](), time.monotonic() + seconds
+    cob_ids, end = set[int](), time.monotonic() + seconds
     with closing(Link(open_can(where), time.monotonic_ns)) as link:
-        while 0x700 + node not in heard and time.monotonic() < end:
-            heard |= {frame.cob_id for frame in link.poll(0.1)}
-    assert 0x700 + node in heard
+        while 0x700 + node not in cob_ids and time.monotonic() < end:
+            cob_ids |= {frame.cob_id for frame in link.poll(0.1)}
+    assert 0x700 + node in cob_ids

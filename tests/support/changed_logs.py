@@ -66,7 +66,7 @@ def write_bomb(out: Path, kind: str) -> Path:
     return out
 
 
-def _append_chunk(file: McapFile, packed: bytes, declared: int) -> None:
+def _append_chunk(file: McapFile, packed: bytes, declared_size: int) -> None:
     at = file._offset
-    file._write(encode_records([Chunk("zstd", packed, 0, 0, zlib.crc32(b""), declared)]))
-    file._chunks.append(ChunkIndex(file._offset - at, at, "zstd", len(packed), 0, 0, {}, 0, declared))
+    file._write(encode_records([Chunk("zstd", packed, 0, 0, zlib.crc32(b""), declared_size)]))
+    file._chunks.append(ChunkIndex(file._offset - at, at, "zstd", len(packed), 0, 0, {}, 0, declared_size))

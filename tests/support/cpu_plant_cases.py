@@ -46,7 +46,7 @@ def print_hashes() -> None:
     }
     hashes = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()) for name, x in cases.items()}
     hashes["log of a run"] = hashlib.sha256(repr(read_log(plain)).encode())
-    print(json.dumps({name: found.hexdigest() for name, found in hashes.items()}))
+    print(json.dumps({name: digest.hexdigest() for name, digest in hashes.items()}))
 
 
 def read_log(model: Model) -> list[tuple[int, int, bytes]]:

@@ -32,32 +32,32 @@ class Rack(Desk):
             2205:0 = 1                  the value of an object
         """
         for line in script.strip().splitlines():
-            action, _, expected = (part.strip() for part in line.partition("->" if "->" in line else "="))
+            action, _, pattern = (part.strip() for part in line.partition("->" if "->" in line else "="))
             first, *rest = action.split()
             index, _, sub = (rest if first == "write" else [first])[0].partition(":")
             before = len(self.heard)
             if first == "write":
-                found = self.download(int(index, 16), int(sub, 16), bytes.fromhex(rest[1]))
+                answer = self.download(int(index, 16), int(sub, 16), bytes.fromhex(rest[1]))
             elif sub:
-                found = str(self.node.od.values[int(index, 16), int(sub, 16)])
+                answer = str(self.node.od.values[int(index, 16), int(sub, 16)])
             else:
                 if first == "wait":
                     for _ in range(int(rest[0])):
                         self.wait(MS)
                 else:
                     self.send(int(first, 16), bytes.fromhex("".join(rest)))
-                found = ", ".join(f"{cob_id:03X} {data.hex()}" for _, cob_id, data in self.heard[before:])
-            assert fnmatchcase(found, expected), (line, found)
+                answer = ", ".join(f"{cob_id:03X} {data.hex()}" for _, cob_id, data in self.heard[before:])
+            assert fnmatchcase(answer, pattern), (line, answer)
 
 
 def change_sheet(folder: Path, *changes: tuple[str, str, str], more: str = "") -> Path:
     """The EDS of node 3 with words of some sections replaced, (section, old, new) each, and more sections."""
     text = EDS[3].read_text()
     for section, old, new in changes:
-        head, found, tail = text.partition(f"[{section}]\n")
+        head, title, tail = text.partition(f"[{section}]\n")
         body, gap, rest = tail.partition("\n[")
-        assert found and old in body, (section, old)
-        text = head + found + body.replace(old, new, 1) + gap + rest
+        assert title and old in body, (section, old)
+        text = head + title + body.replace(old, new, 1) + gap + rest
     path = folder / "changed.eds"
     path.write_text(text + more)
     return path

@@ -51,10 +51,10 @@ def wear(x, m, s, u, p):
 
 
 @contextmanager
-def restored_catalogue(*kept: str) -> Iterator[None]:
-    """Takes out again what was registered meanwhile; with only the `kept` effects, if any are named: a short search."""
+def restored_catalogue(*effects: str) -> Iterator[None]:
+    """Takes out again what was registered meanwhile; with only these `effects`, if any are named: a short search."""
     before = dict(CATALOGUE)
-    for name in set(CATALOGUE) - set(kept or CATALOGUE):
+    for name in set(CATALOGUE) - set(effects or CATALOGUE):
         del CATALOGUE[name]
     try:
         yield

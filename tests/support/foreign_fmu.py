@@ -33,11 +33,12 @@ def build_fmu(path: Path, version: str = "3", does: str = "NOTHING", at: int = -
     """
     library = path.with_suffix(".so")
     flags = [f"-DDOES={does}", f"-DSTEP_THAT={at}", *(["-DFMI3"] if version == "3" else [])]
-    known = {"2": fmpy.fmi2.FMU2Slave, "3": fmpy.fmi3.FMU3Slave}[version]
-    others = path.with_suffix(".c")
-    others.write_text("".join(f"int {name}(void) {{ return 3; }}\n" for name in dir(known)
-                              if stubs and name.startswith(f"fmi{version}") and f"{name}(" not in SOURCE.read_text()))
-    subprocess.run(["cc", "-shared", "-fPIC", "-w", "-o", library, *flags, SOURCE, others], check=True)
+    interface = {"2": fmpy.fmi2.FMU2Slave, "3": fmpy.fmi3.FMU3Slave}[version]
+    stub_source = path.with_suffix(".c")
+    stub_source.write_text("".join(f"int {name}(void) {{ return 3; }}\n" for name in dir(interface)
+                                   if stubs and name.startswith(f"fmi{version}")
+                                   and f"{name}(" not in SOURCE.read_text()))
+    subprocess.run(["cc", "-shared", "-fPIC", "-w", "-o", library, *flags, SOURCE, stub_source], check=True)
     scalars = ""
     for i, (name, causality, variability) in enumerate(_VARIABLES, 1):
         start = "" if causality == "output" or name == "d" else ' start="0"'

@@ -24,9 +24,9 @@ def sample_noise(seed: int, rows: int, colour: str = "white") -> np.ndarray:
     rng = np.random.default_rng(seed)
     out = rng.standard_normal((rows, 3))
     if colour != "white":
-        held, x = 0.0, np.empty(rows)
+        state, x = 0.0, np.empty(rows)
         for k, draw in enumerate((np.sqrt(1 - TURN**2) * rng.standard_normal(rows)).tolist()):
-            held = x[k] = TURN * held + draw
+            state = x[k] = TURN * state + draw
         out[:, 0] = np.sqrt(1 - HUM**2 / 2) * x + HUM * np.sin(2 * np.pi * 0.05 * np.arange(rows) + 0.5)
     return out * LEVELS
 
@@ -60,23 +60,23 @@ def record_healthy(seed: int = 0, colour: str = "white") -> Trace:
 
 def make_backlash(width: float) -> Callable[[float], float]:
     """A transducer with that play, m, in its coupling."""
-    held = 0.0
+    reading = 0.0
 
     def sense(x: float) -> float:
-        nonlocal held
-        held = min(max(held, x - width / 2), x + width / 2)
-        return held
+        nonlocal reading
+        reading = min(max(reading, x - width / 2), x + width / 2)
+        return reading
 
     return sense
 
 
 def make_lag(time: float) -> Callable[[float], float]:
     """A transducer with a first-order lag of `time` s, sampled each ms."""
-    held, keep = 0.0, float(np.exp(-1e-3 / time))
+    reading, keep = 0.0, float(np.exp(-1e-3 / time))
 
     def sense(x: float) -> float:
-        nonlocal held
-        held = keep * held + (1 - keep) * x
-        return held
+        nonlocal reading
+        reading = keep * reading + (1 - keep) * x
+        return reading
 
     return sense

@@ -27,12 +27,12 @@ def compiles_for(feature: str) -> bool:
     return f"+{feature}" in cpu_target.target_context.codegen().magic_tuple()[2].split(",")
 
 
-def list_disabled_features(*kept: str) -> str:
-    """Switches off the vector code of NumPy that this CPU has, but for that of the `kept` instruction sets."""
+def list_disabled_features(*instruction_sets: str) -> str:
+    """Switches off the vector code of NumPy that this CPU has, but for that of the `instruction_sets`."""
     core = np._core._multiarray_umath  # type: ignore[attr-defined]
-    already = os.environ.get("NPY_DISABLE_CPU_FEATURES", "").split()  # this process may run under such a setting itself
-    found = [name for name in core.__cpu_dispatch__ if core.__cpu_features__[name] or name in already]
-    return " ".join(name for name in found if name not in kept)
+    disabled_features = os.environ.get("NPY_DISABLE_CPU_FEATURES", "").split()  # this process may have such a setting
+    features = [name for name in core.__cpu_dispatch__ if core.__cpu_features__[name] or name in disabled_features]
+    return " ".join(name for name in features if name not in instruction_sets)
 
 
 THIS, AVX2, OLDEST = "this CPU", "AVX2 and FMA (2013)", "no vector code beyond SSE2, no FMA"
@@ -40,14 +40,14 @@ THIS, AVX2, OLDEST = "this CPU", "AVX2 and FMA (2013)", "no vector code beyond S
 
 def list_cpu_settings() -> dict[str, Mapping[str, str]]:
     """Name of a CPU and the environment that stands for it; only CPUs whose instructions this one has too."""
-    found: dict[str, Mapping[str, str]] = {THIS: {}}
+    settings: dict[str, Mapping[str, str]] = {THIS: {}}
     if all(get_host_cpu_features().get(feature) for feature in HASWELL):
-        found[AVX2] = {
+        settings[AVX2] = {
             "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ",".join(f"+{feature}" for feature in HASWELL),
             "NPY_DISABLE_CPU_FEATURES": list_disabled_features("AVX", "F16C", "FMA3", "AVX2", "X86_V3")}
-    found[OLDEST] = {"NUMBA_CPU_NAME": "generic", "OPENBLAS_CORETYPE": "Nehalem", "GLIBC_TUNABLES": WITHOUT_FMA,
-                     "NPY_DISABLE_CPU_FEATURES": list_disabled_features()}
-    return found
+    settings[OLDEST] = {"NUMBA_CPU_NAME": "generic", "OPENBLAS_CORETYPE": "Nehalem", "GLIBC_TUNABLES": WITHOUT_FMA,
+                        "NPY_DISABLE_CPU_FEATURES": list_disabled_features()}
+    return settings
 
 
 def list_environment() -> dict[str, str]:

@@ -22,12 +22,12 @@ Plant = namedtuple("Plant", (
 
 def convert_parameters(v: Mapping[str, float]) -> Plant:
     """The symbols from "group.field" values; clogging after the law "sqrt"."""
-    left = 1 - v["filter.clogging"]
+    opening = 1 - v["filter.clogging"]
     assert v["filter.law"] == 0.5
     return Plant(
         v["controller.proportional_gain"], v["controller.current_limit"], v["torque_motor.gain"], v["flapper.inertia"],
         v["flapper.damping"], v["flapper.stiffness"], v["flapper.travel"], v["feedback_spring.stiffness"],
-        v["pilot.flow_gain"] * left**0.5, v["pilot.pressure_gain"] * left, v["supply.pressure"] * left,
+        v["pilot.flow_gain"] * opening**0.5, v["pilot.pressure_gain"] * opening, v["supply.pressure"] * opening,
         v["spool.end_area"], v["spool.mass"], v["spool.damping"], v["spool.static_friction"],
         v["spool.dynamic_friction"], v["spool.travel"], v["valve.flow_gain"], v["valve.pressure_gain"],
         v["supply.pressure"], v["jack.area"], v["jack.mass"], v["jack.damping"], v["jack.static_friction"],
@@ -58,12 +58,12 @@ def _move(x: float, v: float, acceleration: float, h: float, travel: float) -> t
 
 
 @numba.njit
-def _explicit(p: Any, com: Any, measured: Any, replay: bool, load: Any, substeps: int, out: Any) -> None:
+def _explicit(p: Any, com: Any, measured_current: Any, replay: bool, load: Any, substeps: int, out: Any) -> None:
     xf = vf = xs = vs = xj = vj = p12 = current = 0.0
     h = 1e-3 / substeps
     for k in range(len(com)):
-        wanted = p.GAP * (com[k] - xj)
-        answer = measured[k] if replay else min(max(wanted, -p.Imax), p.Imax)
+        law_current = p.GAP * (com[k] - xj)
+        answer = measured_current[k] if replay else min(max(law_current, -p.Imax), p.Imax)
         out[0, k], out[1, k], out[2, k], out[3, k] = xj, answer, p12, xs
         for _ in range(substeps):
             acceleration = (p.GM * current - p.KSF * xs - p.KF * xf - p.BF * vf) / p.JF
@@ -82,13 +82,14 @@ def _explicit(p: Any, com: Any, measured: Any, replay: bool, load: Any, substeps
         current = answer
 
 
-def simulate_explicit(v: Mapping[str, float], com: Any, load: Any = None, measured: Any = None,
+def simulate_explicit(v: Mapping[str, float], com: Any, load: Any = None, measured_current: Any = None,
                       substeps: int = 1000) -> Any:
-    """Rows XJ, Cor, P12, XS, shape (4, n), at 1 us (semi-implicit Euler); `measured` current instead of the law's."""
+    """Rows XJ, Cor, P12, XS, shape (4, n), at 1 us (semi-implicit Euler); `measured_current` instead of the law's."""
     out = np.empty((4, len(com)))
     force = np.zeros(len(com)) if load is None else np.asarray(load, float)
-    replayed = np.zeros(len(com)) if measured is None else np.asarray(measured, float)
-    _explicit(convert_parameters(v), np.asarray(com, float), replayed, measured is not None, force, substeps, out)
+    current = np.zeros(len(com)) if measured_current is None else np.asarray(measured_current, float)
+    _explicit(convert_parameters(v), np.asarray(com, float), current, measured_current is not None, force, substeps,
+              out)
     return out
 
 

@@ -38,12 +38,12 @@ def bus_of(nodeid: str) -> str | None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Take the socketcan tests out if the guest is going to run them, which takes minutes and so comes first."""
-    runner_there = any(item.nodeid.startswith(RUNNER) for item in items)
+    has_runner = any(item.nodeid.startswith(RUNNER) for item in items)
     items.sort(key=lambda item: not item.nodeid.startswith(RUNNER))
-    if not runner_there or kernel_has_vcan0() or guest_missing():
+    if not has_runner or kernel_has_vcan0() or guest_missing():
         return
-    left = [item for item in items if bus_of(item.nodeid) == "socketcan"]
-    config.stash[LEFT_TO_GUEST] = len(left)
-    if left:
-        config.hook.pytest_deselected(items=left)
+    guest_items = [item for item in items if bus_of(item.nodeid) == "socketcan"]
+    config.stash[LEFT_TO_GUEST] = len(guest_items)
+    if guest_items:
+        config.hook.pytest_deselected(items=guest_items)
         items[:] = [item for item in items if bus_of(item.nodeid) != "socketcan"]

@@ -109,12 +109,12 @@ class CanDevice(PythonDevice):
 
     def take(self, message: can.Message) -> list[can.Message]:
         try:
-            known = self._database.get_message_by_frame_id(message.arbitration_id)
+            definition = self._database.get_message_by_frame_id(message.arbitration_id)
         except KeyError:
             return []
-        values = known.decode(message.data)
+        values = definition.decode(message.data)
         self._values |= values
-        if known.name != self._on or "Measured" not in values:  # once a cycle, not for each page
+        if definition.name != self._on or "Measured" not in values:  # once a cycle, not for each page
             return []
         amperes = compute_current(*(self._values[name] * self._position for name in ("Position", "Measured")))
         answer = self._database.get_message_by_name("Drive")

@@ -119,15 +119,15 @@ def grown(path: Path, size: int, process: subprocess.Popen[Any], timeout: float 
 
 def nodes_on(where: str) -> list[int]:
     """Processes that run a node on that bus."""
-    found = []
+    processes = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             with contextlib.suppress(OSError):
                 words = (entry / "cmdline").read_bytes().split(b"\0")
                 is_node = b"node" in words or b"/controller-" in words[0]  # in Python, or the C firmware
                 if is_node and where.encode() in words and entry.name != str(os.getpid()):
-                    found.append(int(entry.name))
-    return found
+                    processes.append(int(entry.name))
+    return processes
 
 
 def is_running(pid: int) -> bool:
@@ -188,14 +188,14 @@ def play(one: Job, folder: Path, stop: Callable[[], bool] = never) -> Outcome:
 
 def stop_after(questions: int) -> Callable[[], bool]:
     """An operator who presses Ctrl-C after the run has asked for it so often, each time cycles are over."""
-    asked = iter(range(10**9))
-    return lambda: next(asked) >= questions
+    counter = iter(range(10**9))
+    return lambda: next(counter) >= questions
 
 
 def act_at(question: int, act: Callable[[], object]) -> Callable[[], bool]:
     """Nobody stops the run, but when it asks for that time something happens."""
-    asked = iter(range(10**9))
-    return lambda: bool(next(asked) == question and act())
+    counter = iter(range(10**9))
+    return lambda: bool(next(counter) == question and act())
 
 
 def read_signals(folder: Path) -> np.ndarray:
