@@ -70,9 +70,9 @@ def test_current_follows_the_error_up_to_its_limit(drive: DriveDesk, target: int
 
 def test_what_it_does_not_know_is_refused(drive: DriveDesk) -> None:
     modes, code, gain = drive.sdo[0x6060], drive.sdo[0x605A], drive.sdo[0x2002][1]
-    refused = [*((modes, mode) for mode in (-1, 1, 3, 6, 7, 9)), (code, 3), (code, 5), (gain, float("nan")),
-               (gain, -1.0)]
-    for leaf, value in refused:
+    writes = [*((modes, mode) for mode in (-1, 1, 3, 6, 7, 9)), (code, 3), (code, 5), (gain, float("nan")),
+              (gain, -1.0)]
+    for leaf, value in writes:
         before = leaf.raw
         with pytest.raises(canopen.SdoAbortedError) as caught:
             leaf.raw = value

@@ -79,9 +79,9 @@ def test_the_servos_firmware() -> None:
     """10 out and 7 back, without delay, and nearly without anything left."""
     columns = np.loadtxt(DATA / "exp_data_2_2.csv.gz", delimiter=";", skiprows=61, usecols=(9, 13, 14, 16))
     answer, demand, position, valve = columns.T
-    found = fit_directional_gains(demand - position, answer, valve)
-    assert (found.out, found.back) == pytest.approx((10.0, 7.0), abs=0.05)
-    assert found.delay == 0 and found.residual < 0.01 * found.answer
+    law = fit_directional_gains(demand - position, answer, valve)
+    assert (law.out, law.back) == pytest.approx((10.0, 7.0), abs=0.05)
+    assert law.delay == 0 and law.residual < 0.01 * law.answer
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +95,10 @@ def other_command() -> Diagnosis:
 def test_global_optimisers_leave_less_than_the_grid(name: str, other_command: Diagnosis) -> None:
     d, grid = other_command, (0.1, 38.0)
     at_grid = methods.Objective(methods.make_problem(d.model, d.trace, d.floor), d.model, grid)
-    left = at_grid.report("grid", at_grid.start).left
-    found = methods.METHODS[name](d.model, d.trace, grid, d.floor, 0)
-    assert found.left < 0.9 * left and 200 < found.simulations < 500
-    assert 19.0 <= found.fss <= 76.0 and 0.0 <= found.kintas <= 0.3
+    grid_residual = at_grid.report("grid", at_grid.start).left
+    row = methods.METHODS[name](d.model, d.trace, grid, d.floor, 0)
+    assert row.left < 0.9 * grid_residual and 200 < row.simulations < 500
+    assert 19.0 <= row.fss <= 76.0 and 0.0 <= row.kintas <= 0.3
 
 
 @pytest.mark.skipif(not methods.is_installed("sklearn"), reason="needs scikit-learn")
@@ -107,8 +107,8 @@ def test_learners_know_units_that_they_never_saw(other_command: Diagnosis) -> No
                                        frictions=(5.0, 45.0, 90.0), held_out=4)
     assert data.unseen.sum() == 2 * 3 * 4
     for learner in methods.LEARNERS.values():
-        found = learner(data)
-        assert found.right[FRICTION.name] > 0.9 and found.levels[FRICTION.name] == Level.MAINTENANCE.word
+        row = learner(data)
+        assert row.right[FRICTION.name] > 0.9 and row.levels[FRICTION.name] == Level.MAINTENANCE.word
 
 
 LOST, TOLERATED = FAULTS[0], FAULTS[5]
@@ -143,23 +143,23 @@ needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason=f"no gcc; {be
 def list_sound_rivals(compare: Callable[..., Sequence[rivals.Rival]], **options: Any) -> dict[str, rivals.Rival]:
     """The rivals by name; those that are not installed say so, the others make the same numbers."""
     stages: list[str] = []
-    found = {rival.name: rival for rival in compare(PREFLIGHT[:1500], lambda stage, share: stages.append(stage),
-                                                    rounds=2, **options)}
-    assert len(found) == 8 and stages
-    for name, rival in found.items():
+    rivals_by_name = {rival.name: rival for rival in compare(
+        PREFLIGHT[:1500], lambda stage, share: stages.append(stage), rounds=2, **options)}
+    assert len(rivals_by_name) == 8 and stages
+    for name, rival in rivals_by_name.items():
         if rival.speed is None:
             assert name.startswith(("jax", "ProgPy")) and "is not installed" in rival.note
         elif name != grid_runs.REFERENCE:
             assert rival.ratio > 0.0 and rival.difference < 1e-12
-    return found
+    return rivals_by_name
 
 
 @needs_gcc
 def test_every_rival_makes_the_same_runs() -> None:
     """Those of the `bench` extra where it is installed; without fused multiply-add C even to the last bit."""
-    found = list_sound_rivals(many_runs.compare_many_runs, cycles=300)
+    rivals_by_name = list_sound_rivals(many_runs.compare_many_runs, cycles=300)
     for name in (many_runs.OURS, "ours, a thread a core", "C, 16 runs, -ffp-contract=off"):
-        assert found[name].difference == 0.0
+        assert rivals_by_name[name].difference == 0.0
 
 
 @needs_gcc
@@ -212,8 +212,8 @@ def test_the_study_as_a_whole() -> None:
     assert [count["works"] and count["frames"] >= 2000 for count in figures["frames"]] == [True] * 3
     assert min(count["answers"] for count in figures["frames"][:2]) > 40
     assert max(figures["datagrams"]["growth"].values()) < 16 << 20
-    accepted, refused = figures["logs"]["accepted"], figures["logs"]["refused"]
-    assert accepted["recover"] > 0 and accepted["report"] + refused["report"] == 2
+    logs = figures["logs"]
+    assert logs["accepted"]["recover"] > 0 and logs["accepted"]["report"] + logs["refused"]["report"] == 2
     report = build_robustness_report(figures)
     assert report.verdict == "PASS" and len(report.sections) == 4
     assert not find_processes("239.1.1.1")
@@ -275,20 +275,20 @@ def test_the_plants_effects_are_what_the_table_says_as_written_twice() -> None:
     load = command.known_load_profile(len(com), 6000.0)
     drive = simulate_truth(com, {}, load=load).cor
     # of a signed effect one seed gives the sign -, one +
-    drawn = [hidden.sample_hidden_effect(name, nominal_symbols(), np.random.default_rng(seed), 0.7, 0.7)
-             for seed in (1, 2) for name, law in hidden.CATALOGUE.items() if seed == 1 or law.signed]
-    drawn = [effect for effect in drawn if effect.name != "command_rate_limit"]  # not in the plant
+    effects = [hidden.sample_hidden_effect(name, nominal_symbols(), np.random.default_rng(seed), 0.7, 0.7)
+               for seed in (1, 2) for name, law in hidden.CATALOGUE.items() if seed == 1 or law.signed]
+    effects = [effect for effect in effects if effect.name != "command_rate_limit"]  # not in the plant
     model = complete_model(Model())  # the kernels of `rig explain`
-    names = sorted({name for effect in drawn for name in plants(effect)})
-    rows = [[plants(effect).get(name, model[name]) for name in names] for effect in drawn]
-    ours = Lanes(model, names, 100).replay(np.array(rows), drive, load)
-    for effect, mine in zip(drawn, ours, strict=True):
-        known = set(parameter_names()) - {"bristle_v"}
-        changes = {key: value for key, value in effect.changes.items() if key in known}
+    names = sorted({name for effect in effects for name in plants(effect)})
+    rows = [[plants(effect).get(name, model[name]) for name in names] for effect in effects]
+    outputs = Lanes(model, names, 100).replay(np.array(rows), drive, load)
+    for effect, run in zip(effects, outputs, strict=True):
+        symbols = set(parameter_names()) - {"bristle_v"}
+        changes = {key: value for key, value in effect.changes.items() if key in symbols}
         truth = simulate_truth(com, changes, load=load, cor=drive)
-        columns = zip(mine.T, (truth.xj, truth.p12, truth.xs), (2e-6, 2e4, 1e-6), strict=True)
-        left = [rms(x - y) / floor for x, y, floor in columns]
-        assert max(left) < (1.0 if effect.name == "compressibility" else 0.5), (effect.name, effect.size, left)
+        columns = zip(run.T, (truth.xj, truth.p12, truth.xs), (2e-6, 2e4, 1e-6), strict=True)
+        errors = [rms(x - y) / floor for x, y, floor in columns]
+        assert max(errors) < (1.0 if effect.name == "compressibility" else 0.5), (effect.name, effect.size, errors)
 
 
 def truth(kind: str, effects: Sequence[str] = (), floors: float = 9.0, where: Sequence[str] = ("xj/s02", "xs/s03"),
@@ -326,9 +326,10 @@ PAIRS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 def folder(tmp_path: Path) -> Path:
     """A benchmark of invented cases, with invented answers."""
     (tmp_path / "truth").mkdir()
-    for case, (told, _) in PAIRS.items():
-        (tmp_path / "truth" / f"{case}.json").write_text(json.dumps(told))
-    (tmp_path / "answers.json").write_text(json.dumps({"answers": {case: given for case, (_, given) in PAIRS.items()}}))
+    for case, (truth, _) in PAIRS.items():
+        (tmp_path / "truth" / f"{case}.json").write_text(json.dumps(truth))
+    (tmp_path / "answers.json").write_text(json.dumps({
+        "answers": {case: answer for case, (_, answer) in PAIRS.items()}}))
     return tmp_path
 
 
@@ -341,8 +342,8 @@ def run_script(*arguments: object) -> subprocess.CompletedProcess[str]:
 @needs_simulator
 def test_rates_count_what_they_say(folder: Path) -> None:
     scores = json.loads(run_script(folder, folder / "answers.json", "--json").stdout)
-    found = {rate["name"]: (rate["good"], rate["of"], rate["without"]) for rate in scores["rates"]}
-    assert found == {
+    rates = {rate["name"]: (rate["good"], rate["of"], rate["without"]) for rate in scores["rates"]}
+    assert rates == {
         "nothing: answered nothing": (1, 2, ["00001"]),
         "nothing: an effect is named": (1, 2, ["00000"]),
         "one: named": (2, 4, ["00004", "00010"]),
@@ -362,7 +363,7 @@ def test_rates_count_what_they_say(folder: Path) -> None:
 
 
 @needs_simulator
-@pytest.mark.parametrize(("text", "expected"), [
+@pytest.mark.parametrize(("text", "message"), [
     ("[", "expected a JSON file"),
     ("{}", "expected an object with one entry per case"),
     ('{"00002": {"verdict": "perhaps"}}', "case 00002: verdict: expected nothing, explained"),
@@ -370,8 +371,8 @@ def test_rates_count_what_they_say(folder: Path) -> None:
     ('{"00002": {"verdict": "nothing", "effects": "coil_lag"}}', "case 00002: effects: expected a list"),
     ('{"00002": {"verdict": "nothing", "sizes": {"a": {"low": "x"}}}}', "sizes, holdout, seconds: expected finite"),
 ])
-def test_bad_answers_are_refused_in_one_line(text: str, expected: str, folder: Path) -> None:
+def test_bad_answers_are_refused_in_one_line(text: str, message: str, folder: Path) -> None:
     (folder / "answers.json").write_text(text)
     done = run_script(folder, folder / "answers.json")
     assert done.returncode == 2 and done.stdout == "" and len(done.stderr.splitlines()) == 1
-    assert done.stderr.startswith(f"score.py: {folder / 'answers.json'}: ") and expected in done.stderr
+    assert done.stderr.startswith(f"score.py: {folder / 'answers.json'}: ") and message in done.stderr

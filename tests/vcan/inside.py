@@ -128,8 +128,8 @@ def play_by_three(out: Path) -> int:
         status = play(out, "run", "--controller", "external", "--plant", "external", "--pace", "lockstep")
         alive = {name: process.poll() for name, process in nodes.items()}
         time.sleep(0.5)  # the last frames still go to candump
-    ended = {name: process.returncode for name, process in nodes.items()}
-    facts = {"status": status, "before_interrupt": alive, "after_interrupt": ended}
+    exit_codes = {name: process.returncode for name, process in nodes.items()}
+    facts = {"status": status, "before_interrupt": alive, "after_interrupt": exit_codes}
     (out / "facts.json").write_text(json.dumps(facts))
     return status
 

@@ -79,8 +79,8 @@ def test_a_run_by_three_processes_passes(out: Path, frames: list[tuple[int, byte
     text = (out / "run.json").read_text()
     assert text, f"rig run answered nothing: {facts}\n{logs}"
     answer = json.loads(text)
-    failed = [check["name"] for check in answer["checks"] if not check["passed"]]
-    assert (answer["verdict"], facts["status"]) == ("PASS", 0), f"{answer['why']}; failed: {failed}; {facts}\n{logs}"
+    failures = [check["name"] for check in answer["checks"] if not check["passed"]]
+    assert (answer["verdict"], facts["status"]) == ("PASS", 0), f"{answer['why']}; failed: {failures}; {facts}\n{logs}"
     assert all(status in (0, 130) for status in facts["after_interrupt"].values()), logs
     counts = Counter(cob_id for cob_id, _ in frames)
     assert counts[0x080] >= answer["timing"]["cycles"] == 450
@@ -91,8 +91,8 @@ def test_a_run_of_an_example_passes(out: Path) -> None:
     text = (out / "ecu.json").read_text()
     assert text, (out / "output.txt").read_text()
     answer = json.loads(text)
-    failed = [check["name"] for check in answer["checks"] if not check["passed"]]
-    assert (answer["verdict"], failed, answer["timing"]["cycles"]) == ("PASS", [], 450), answer["why"]
+    failures = [check["name"] for check in answer["checks"] if not check["passed"]]
+    assert (answer["verdict"], failures, answer["timing"]["cycles"]) == ("PASS", [], 450), answer["why"]
 
 
 def test_rows_are_byte_for_byte_those_of_the_builtin_controller(
@@ -105,10 +105,10 @@ def test_rows_are_byte_for_byte_those_of_the_builtin_controller(
 
 def test_log_holds_what_was_on_the_bus(out: Path, frames: list[tuple[int, bytes]]) -> None:
     """The run's own log and candump count the same cyclic frames; boot-ups may come before the log is open."""
-    heard = Counter(cob_id for cob_id, _ in frames)
-    logged = Counter(frame.cob_id for frame in read_raw_frames(out / "run" / "trace.mcap"))
-    assert {cob_id: logged[cob_id] for cob_id in CYCLIC} == {cob_id: heard[cob_id] for cob_id in CYCLIC}
-    assert all(logged[cob_id] <= heard[cob_id] for cob_id in logged)
+    bus_counts = Counter(cob_id for cob_id, _ in frames)
+    log_counts = Counter(frame.cob_id for frame in read_raw_frames(out / "run" / "trace.mcap"))
+    assert {cob_id: log_counts[cob_id] for cob_id in CYCLIC} == {cob_id: bus_counts[cob_id] for cob_id in CYCLIC}
+    assert all(log_counts[cob_id] <= bus_counts[cob_id] for cob_id in log_counts)
 
 
 def test_the_check_of_a_guest_names_the_missing_package(tmp_path: Path) -> None:
