@@ -25,14 +25,14 @@ def main() -> None:
     parts, bands, model = find_sections(com), load_default_bands(), load_model()
     for name, changes, count, seed in UNITS:
         x = simulate_units(model, com, np.zeros_like(com), changes, count, seed)
-        found = [judge_position(com, row, 1e-3, bands, parts=parts) for row in x]
-        shares = [100 * np.mean([j.levels.get(f.name, Level.ACCEPTABLE) >= level for j in found])
+        judgements = [judge_position(com, row, 1e-3, bands, parts=parts) for row in x]
+        shares = [100 * np.mean([j.levels.get(f.name, Level.ACCEPTABLE) >= level for j in judgements])
                   for f in FAULTS for level in (Level.MAINTENANCE, Level.NON_NOMINAL)]
         print(f"| {name} | {count} |", " | ".join(f"{share:.1f} %" for share in shares), "|", flush=True)
-    for name, known in bands.precursors.items():
-        cells = [format_precursor(known[key], name) for key in ("healthy", "noise")]
+    for name, numbers in bands.precursors.items():
+        cells = [format_precursor(numbers[key], name) for key in ("healthy", "noise")]
         for fault in FAULTS:
-            cells += [format_precursor(known[fault.name], name), f"{known[fault.name] / known['noise']:+.1f}"]
+            cells += [format_precursor(numbers[fault.name], name), f"{numbers[fault.name] / numbers['noise']:+.1f}"]
         print("|", " | ".join([name, *cells]), "|")
 
 

@@ -62,11 +62,11 @@ def damage_files(files: Mapping[str, bytes], chance: random.Random) -> dict[str,
 
 
 def _flip_bytes(data: bytes, chance: random.Random) -> bytes:
-    changed = bytearray(data)
+    mutant = bytearray(data)
     for _ in range(chance.randint(1, 4)):
-        if changed:
-            changed[chance.randrange(len(changed))] = chance.randrange(256)
-    return bytes(changed)
+        if mutant:
+            mutant[chance.randrange(len(mutant))] = chance.randrange(256)
+    return bytes(mutant)
 
 
 def _cut(data: bytes, chance: random.Random) -> bytes:
@@ -88,19 +88,19 @@ def _change_lines(data: bytes, chance: random.Random) -> bytes:
 
 
 def _change_number(data: bytes, chance: random.Random) -> bytes:
-    found = list(re.finditer(rb"(?:0x)?[0-9A-Fa-f]*[0-9][0-9A-Fa-f.]*", data))
-    if not found:
+    matches = list(re.finditer(rb"(?:0x)?[0-9A-Fa-f]*[0-9][0-9A-Fa-f.]*", data))
+    if not matches:
         return data
-    place = chance.choice(found)
-    other = chance.choice(NUMBERS).encode() if chance.random() < 0.5 else chance.choice(found)[0]
+    place = chance.choice(matches)
+    other = chance.choice(NUMBERS).encode() if chance.random() < 0.5 else chance.choice(matches)[0]
     return data[:place.start()] + other + data[place.end():]
 
 
 def _change_word(data: bytes, chance: random.Random) -> bytes:
-    found = list(re.finditer(rb"[A-Za-z_]{2,}|[=\[\]{}:|@+,()\"-]", data))
-    if not found:
+    matches = list(re.finditer(rb"[A-Za-z_]{2,}|[=\[\]{}:|@+,()\"-]", data))
+    if not matches:
         return data
-    place, other = chance.choice(found), chance.choice(found)[0]
+    place, other = chance.choice(matches), chance.choice(matches)[0]
     return data[:place.start()] + (b"" if chance.random() < 0.3 else other) + data[place.end():]
 
 

@@ -122,21 +122,21 @@ def _run(text: str, folder: Path, seed: int) -> Outcome:
 def measure_cell(fault: BusFault, phase: str, outcome: Outcome, sound: Path, faulty: Path) -> Cell:
     """The figures of a cell from its run and from the run without faults."""
     start = PHASES[phase]
-    found = {check.name: check for check in outcome.checks}
-    values = {name: None if name not in found or np.isnan(found[name].value) else MS * found[name].value
+    checks = {check.name: check for check in outcome.checks}
+    values = {name: None if name not in checks or np.isnan(checks[name].value) else MS * checks[name].value
               for name in ("reaction", "recovery")}
     troubles = [event for event in outcome.events if event.kind in _DETECTING and event.level == "ERROR"
                 and event.t >= start]
     first = min(troubles, key=lambda event: event.t, default=None)
     before, after = (Trace.read(folder).xj for folder in (sound, faulty))
     common = min(len(before), len(after))
-    apart = np.abs(before[:common] - after[:common])
-    shown = find_first_difference(sound, faulty)
+    deviation = np.abs(before[:common] - after[:common])
+    difference_time = find_first_difference(sound, faulty)
     return Cell(fault.name, phase, None if fault.limit is None else MS * fault.limit,
-                None if shown is None else round(MS * (shown - start), 6),
+                None if difference_time is None else round(MS * (difference_time - start), 6),
                 None if first is None else round(MS * (first.t - start), 6), "" if first is None else first.text,
                 _round(values["reaction"]), _round(values["recovery"]),
-                None if np.isnan(apart).all() else round(1e6 * float(np.nanmax(apart)), 3),
+                None if np.isnan(deviation).all() else round(1e6 * float(np.nanmax(deviation)), 3),
                 outcome.verdict in ("PASS", "NOT_JUDGED"))  # a fault that must not be noticed has no checks
 
 
@@ -162,29 +162,29 @@ def _list_frames(folder: Path) -> Iterator[tuple[float, int, bytes]]:
 
 def collect_figures(cells: list[Cell], seed: int) -> dict[str, Any]:
     """The JSON answer of the study."""
-    failed = [f"{cell.fault}, {cell.phase}" for cell in cells if not cell.passed]
-    return {"verdict": "FAIL" if failed else "PASS", "failed": failed, "seed": seed,
+    failures = [f"{cell.fault}, {cell.phase}" for cell in cells if not cell.passed]
+    return {"verdict": "FAIL" if failures else "PASS", "failed": failures, "seed": seed,
             "cells": [cell._asdict() for cell in cells]}
 
 
 def build_bus_faults_report(cells: Sequence[Cell], seed: int) -> Report:
     """Report on the cells of `studies.bus_faults.study_bus_faults`."""
     figures = collect_figures(list(cells), seed)
-    failed = figures["failed"]
-    sentence = (f"{len(failed)} of {len(cells)} cells failed: {'; '.join(failed[:4])}" if failed else
+    failures = figures["failed"]
+    sentence = (f"{len(failures)} of {len(cells)} cells failed: {'; '.join(failures[:4])}" if failures else
                 "Every fault was tolerated or answered by zero current in time, and the controller recovered.")
     return Report(
-        command="bench", title="faults on the bus", verdict=figures["verdict"], mood="bad" if failed else "good",
+        command="bench", title="faults on the bus", verdict=figures["verdict"], mood="bad" if failures else "good",
         sentence=sentence,
         sections=[Section("Faults and phases", [_tabulate_matrix(cells)]),
                   Section("All figures", [_tabulate_cells(cells)], medium=Medium.PAGE)], data=figures)
 
 
 def _tabulate_matrix(cells: Sequence[Cell]) -> Table:
-    found = {(cell.fault, cell.phase): cell for cell in cells}
+    matrix = {(cell.fault, cell.phase): cell for cell in cells}
     names = list(dict.fromkeys(cell.fault for cell in cells))
     rows: list[list[TableCell | str]] = [
-        [name, *(_describe_cell(found[name, phase]) for phase in PHASES if (name, phase) in found)] for name in names]
+        [name, *(_describe_cell(matrix[name, phase]) for phase in PHASES if (name, phase) in matrix)] for name in names]
     caption = ("In ms: time from the begin of the fault to zero current of the controller. Tolerated: nothing was "
                "reported; the figure is the largest deviation of the position from the run without faults.")
     return Table([Column("fault"), *(Column(phase, align="right") for phase in PHASES)], rows, caption)
@@ -193,8 +193,8 @@ def _tabulate_matrix(cells: Sequence[Cell]) -> Table:
 def _describe_cell(cell: Cell) -> TableCell:
     mood: Mood = "good" if cell.passed else "bad"
     if cell.limit_ms is None:
-        said = "tolerated" if cell.passed else "NOT TOLERATED"
-        return TableCell(f"{said}, {_format(cell.deviation_um)} um", mood)
+        word = "tolerated" if cell.passed else "NOT TOLERATED"
+        return TableCell(f"{word}, {_format(cell.deviation_um)} um", mood)
     return TableCell(f"{_format(cell.reaction_ms)} ms" + ("" if cell.passed else " FAIL"), mood)
 
 

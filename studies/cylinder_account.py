@@ -55,16 +55,16 @@ def read_folder(folder: Path, model: Model) -> dict[int, dict[str, list[Trace]]]
     Raises:
         InputError: a folder without such files, or a file that cannot be imported.
     """
-    found: dict[int, dict[str, list[Trace]]] = {}
+    runs_by_voltage: dict[int, dict[str, list[Trace]]] = {}
     for file in sorted(folder.glob("*.mat")):
         if name := NAME.fullmatch(file.name):
-            chosen = read_map(MAPS / f"pressure_{name[1].lower()}.toml", model.kind.signals)
-            trace = import_measurement(open_measurement(file), chosen, model["controller.period"]).trace
-            runs = found.setdefault(int(name[2]), {"A": [], "B": []})[name[1]]
+            signal_map = read_map(MAPS / f"pressure_{name[1].lower()}.toml", model.kind.signals)
+            trace = import_measurement(open_measurement(file), signal_map, model["controller.period"]).trace
+            runs = runs_by_voltage.setdefault(int(name[2]), {"A": [], "B": []})[name[1]]
             runs.append(prepare_trace(trace, model, source=file.name))
-    if not found:
+    if not runs_by_voltage:
         raise InputError(folder, "", "a folder with files such as m_find_b_pA_1V_sample_1.mat")
-    return {voltage: found[voltage] for voltage in sorted(found)}
+    return {voltage: runs_by_voltage[voltage] for voltage in sorted(runs_by_voltage)}
 
 
 def measure_motion(runs: dict[str, list[Trace]], voltage: int, model: Model, sign: int) -> Motion:

@@ -67,8 +67,8 @@ def claim_sizes(folder: Path, effects: Sequence[str] = EFFECTS, workers: Workers
     runs = read_runs(Model(), names[0], names[1:2], names[2], COLUMNS)
     answer, _ = explain_runs(runs)
     unit = describe_unit(runs, answer, effects)
-    found = measure_sensitivity(unit, answer, folder / "claims.jsonl", workers, report_progress)
-    return {claim.effect: math.inf if claim.smallest is None else claim.smallest for claim in found}
+    claims = measure_sensitivity(unit, answer, folder / "claims.jsonl", workers, report_progress)
+    return {claim.effect: math.inf if claim.smallest is None else claim.smallest for claim in claims}
 
 
 def run_study(count: int, folder: Path, report_progress: Callable[[BatchProgress], None] = lambda _: None,
@@ -113,11 +113,11 @@ def hide_effect(case: cases.Case, effect: str, size: float) -> cases.Case:
     first = entry.fitted[0]
     value = entry.off.get(first, Model().kind.nominal.get(first, 0.0)) + size
     law = hidden.CATALOGUE[effect]
-    drawn = SIZES[effect](value, plant) if effect in SIZES else value
-    changes = law.apply(drawn, plant)
+    simulator_size = SIZES[effect](value, plant) if effect in SIZES else value
+    changes = law.apply(simulator_size, plant)
     changes |= {symbol: math.sqrt(low * high) for symbol, (low, high) in law.extra.items()}
     changes |= {symbol: values[-1] for symbol, values in law.choices.items()}
-    return case._replace(kind="one", effects=(Hidden(effect, drawn, changes, value, law.known_load),))
+    return case._replace(kind="one", effects=(Hidden(effect, simulator_size, changes, value, law.known_load),))
 
 
 def format_table(rows: Iterable[Row]) -> str:
@@ -126,18 +126,18 @@ def format_table(rows: Iterable[Row]) -> str:
     lines = ["| effect | claimed sizes | " + " | ".join(f"found at {factor:g} times" for factor in FACTORS) + " |",
              "|---|---|" + "---|" * len(FACTORS)]
     for effect in dict.fromkeys(row["effect"] for row in rows):
-        own = [row for row in rows if row["effect"] == effect]
-        sizes = sorted(row["claimed"] for row in own if row.get("claimed") is not None)
+        effect_rows = [row for row in rows if row["effect"] == effect]
+        sizes = sorted(row["claimed"] for row in effect_rows if row.get("claimed") is not None)
         unit = CATALOGUE[effect].parameters[CATALOGUE[effect].fitted[0]].unit
-        said = f"{sizes[0]:.3g} to {sizes[-1]:.3g} {unit}" if sizes else "none"
-        counts = [_count_found(row for row in own if row["factor"] == factor) for factor in FACTORS]
-        lines.append(f"| `{effect}` | {said} | {' | '.join(counts)} |")
+        claim = f"{sizes[0]:.3g} to {sizes[-1]:.3g} {unit}" if sizes else "none"
+        counts = [_count_found(row for row in effect_rows if row["factor"] == factor) for factor in FACTORS]
+        lines.append(f"| `{effect}` | {claim} | {' | '.join(counts)} |")
     return "\n".join(lines)
 
 
 def _count_found(rows: Iterable[Mapping[str, Any]]) -> str:
-    judged = [row["found"] for row in rows if row["found"] is not None]
-    return f"{sum(judged)} of {len(judged)}"
+    outcomes = [row["found"] for row in rows if row["found"] is not None]
+    return f"{sum(outcomes)} of {len(outcomes)}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -148,15 +148,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cases", type=int, help="how many; default: each effect and size")
     parser.add_argument("--jobs", type=int, default=1, help="processes that make the claims (default 1)")
     parser.add_argument("--effects", default=",".join(EFFECTS), help="names, separated by commas; default: all")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
 
     def show(progress: BatchProgress) -> None:
         row = progress.row
         print(f"{progress.done} of {progress.total}: {row['effect']} {row['factor']:g} {row['verdict']}", flush=True)
 
-    effects = given.effects.split(",")
-    claimed = claim_sizes(given.out, effects, Workers(given.jobs), report_claims)
-    print(format_table(run_study(given.cases or 2 * len(effects), given.out, show, effects, claimed)))
+    effects = options.effects.split(",")
+    claimed = claim_sizes(options.out, effects, Workers(options.jobs), report_claims)
+    print(format_table(run_study(options.cases or 2 * len(effects), options.out, show, effects, claimed)))
     return 0
 
 

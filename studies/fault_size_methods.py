@@ -54,9 +54,9 @@ def apply_optimisers(diagnosis: Diagnosis, seed: int, progress: Progress) -> Ite
     for number, (name, method) in enumerate(METHODS.items()):
         progress(name, number / len(METHODS))
         if name != "genetic" or is_installed("pygad"):
-            found, seconds = measure_time(
+            row, seconds = measure_time(
                 partial(method, diagnosis.model, diagnosis.trace, start, diagnosis.floor, seed))
-            yield found._replace(seconds=seconds)
+            yield row._replace(seconds=seconds)
 
 
 def apply_learners(diagnosis: Diagnosis, seed: int, progress: Progress) -> Iterator[Row]:
@@ -71,8 +71,8 @@ def apply_learners(diagnosis: Diagnosis, seed: int, progress: Progress) -> Itera
     lesson, simulation_seconds = measure_time(simulate)
     for name, learner in LEARNERS.items():
         progress(name, 1.0)
-        found, seconds = measure_time(partial(learner, lesson, seed))
-        yield found._replace(seconds=simulation_seconds + seconds)
+        row, seconds = measure_time(partial(learner, lesson, seed))
+        yield row._replace(seconds=simulation_seconds + seconds)
 
 
 def is_installed(package: str) -> bool:
@@ -134,10 +134,10 @@ class Objective:
 
     def report(self, method: str, point: Sequence[float]) -> Row:
         """The answer at a point; evaluating it once more does not count as a simulation."""
-        spent = sum(self.problem.counts)
+        simulations = sum(self.problem.counts)
         white = self._compute_white_residuals(np.asarray(point, float)[None])
-        left = float(np.sqrt(np.mean(white**2)))
-        return Row(method, spent, float(point[0]), math.exp(float(point[1])), left)
+        residual = float(np.sqrt(np.mean(white**2)))
+        return Row(method, simulations, float(point[0]), math.exp(float(point[1])), residual)
 
     def _compute_white_residuals(self, points: Floats) -> Floats:
         x = np.array([make_start(self.free, FAULTS, (k, math.exp(f))) for k, f, _ in points])
@@ -150,9 +150,9 @@ def search_by_least_squares(model: Model, trace: Trace, start: tuple[float, floa
                             seed: int) -> Row:
     """The default: every tolerance and suspect free, Gauss-Newton steps."""
     r = refine_sizes(model, trace, (start, *list_coarse_starts(FAULTS)), floor)
-    left = float(np.sqrt(np.mean(np.square([*r.ratio.values()]))))
+    residual = float(np.sqrt(np.mean(np.square([*r.ratio.values()]))))
     kintas, fss = (r.sizes[fault.name].value for fault in FAULTS)
-    return Row("least squares", r.simulations, kintas, fss, left)
+    return Row("least squares", r.simulations, kintas, fss, residual)
 
 
 def search_by_differential_evolution(model: Model, trace: Trace, start: tuple[float, float],
@@ -236,19 +236,20 @@ def simulate_lesson(trace: Trace, model: Model, seed: int = 0, progress: Progres
     """
     com, parts = hold_last(trace.com), find_sections(trace.com, trace.period)
     xj, rows = trace.mask_unusable("xj"), np.arange(len(trace))
-    there = ~np.isnan(xj)
-    own = compute_features(com, np.interp(rows, rows[there], xj[there])[None], trace.period, parts)
-    if not own:
+    is_measured = ~np.isnan(xj)
+    trace_features = compute_features(com, np.interp(rows, rows[is_measured], xj[is_measured])[None], trace.period,
+                                      parts)
+    if not trace_features:
         raise InputError("--comparators", "com", "steps or slow ramps: the learners see nothing but precursors")
     pairs = [(k, f) for k in cloggings for f in frictions]
     tables = []
     for number, (k, f) in enumerate(pairs):
         progress("simulating faults to learn from", number / len(pairs))
-        made = simulate_units(model, com, trace.load, CLOGGING.list_changes(k) | FRICTION.list_changes(f), units,
-                              seed + number)
-        shown = compute_features(com, made, trace.period, parts)
-        tables.append(np.column_stack([shown[name] for name in own]))
-    x = np.vstack([*tables, np.array([[own[name][0] for name in own]])])
+        positions = simulate_units(model, com, trace.load, CLOGGING.list_changes(k) | FRICTION.list_changes(f), units,
+                                   seed + number)
+        features = compute_features(com, positions, trace.period, parts)
+        tables.append(np.column_stack([features[name] for name in trace_features]))
+    x = np.vstack([*tables, np.array([[trace_features[name][0] for name in trace_features]])])
     x = np.where(np.isfinite(x), x, np.nanmedian(np.where(np.isfinite(x), x, np.nan), axis=0))
     sizes = np.repeat(np.array(pairs), units, axis=0)
     unseen = np.tile(np.arange(units) >= units - held_out, len(pairs))
@@ -305,9 +306,9 @@ def _make_pipeline(*steps: Any) -> Any:
     return make_pipeline(StandardScaler(), *steps)
 
 
-def _count_right(fault: Fault, predicted: Floats, true: Floats) -> float:
+def _count_right(fault: Fault, predictions: Floats, true: Floats) -> float:
     """Share of units whose level is right."""
-    right = [classify_size(fault, a) == classify_size(fault, b) for a, b in zip(predicted, true, strict=True)]
+    right = [classify_size(fault, a) == classify_size(fault, b) for a, b in zip(predictions, true, strict=True)]
     return float(np.mean(right))
 
 
@@ -330,8 +331,8 @@ def compare_methods(args: argparse.Namespace) -> tuple[Report, bool]:
         rows += apply_optimisers(diagnosis, args.seed, report_progress)
     if args.learners or not args.optimisers:
         rows += apply_learners(diagnosis, args.seed, report_progress)
-    found = {fault: diagnosis.sizes[fault.name].value for fault in FAULTS}
-    sizes = ", ".join(f"{fault.symbol} {size:.3g} {fault.unit}".strip() for fault, size in found.items())
+    estimates = {fault: diagnosis.sizes[fault.name].value for fault in FAULTS}
+    sizes = ", ".join(f"{fault.symbol} {size:.3g} {fault.unit}".strip() for fault, size in estimates.items())
     return Report(command="fault_size_methods", title=str(args.trace), sentence=f"rig fdi finds {sizes}.",
                   sections=[build_methods_section(rows)], data={"methods": [row._asdict() for row in rows]}), True
 

@@ -93,14 +93,15 @@ def record_case(job: Job, signals: Sequence[str] = SIGNALS) -> Trace:
 
 def judge_job(job: Job, signals: Sequence[str], sources: str) -> Row:
     """Record the unit and diagnose it with the search for other effects."""
-    found = diagnose(record_case(job, signals), load_model(), workers=count_threads(), with_effects=True)
-    assert found.beside is not None
+    diagnosis = diagnose(record_case(job, signals), load_model(), workers=count_threads(), with_effects=True)
+    assert diagnosis.beside is not None
     row: Row = {"case": job.number, "seed": job.seed, "valve": dict(job.valve), "other": job.other, "sources": sources,
-                "verdict": found.verdict, "effects": list(found.beside.effects), "others": sorted(found.others),
-                "explanations": [[list(e.effects), e.weight] for e in found.beside.explanations],
-                "ratio": max(found.refinement.ratio.values())}
+                "verdict": diagnosis.verdict, "effects": list(diagnosis.beside.effects),
+                "others": sorted(diagnosis.others),
+                "explanations": [[list(e.effects), e.weight] for e in diagnosis.beside.explanations],
+                "ratio": max(diagnosis.refinement.ratio.values())}
     for fault in FAULTS:
-        size, level = found.sizes[fault.name], found.levels[fault.name]
+        size, level = diagnosis.sizes[fault.name], diagnosis.levels[fault.name]
         row[fault.key] = [size.value, size.low, size.high]
         row[f"level_{fault.key}"] = "cannot_tell" if level is None else level.word
     return row
@@ -116,14 +117,14 @@ class Score(NamedTuple):
 
 def score_row(row: Mapping[str, Any]) -> Score:
     """A row against the truth."""
-    true = {f.name: row["valve"].get(f.name, f.healthy) for f in FAULTS}
+    true_sizes = {f.name: row["valve"].get(f.name, f.healthy) for f in FAULTS}
     levels = {f.name: row[f"level_{f.key}"] for f in FAULTS}
-    wanted = {f.name: classify_size(f, true[f.name]).word for f in FAULTS}
-    judged = list(row["valve"]) or [f.name for f in FAULTS]
+    true_levels = {f.name: classify_size(f, true_sizes[f.name]).word for f in FAULTS}
+    fault_names = list(row["valve"]) or [f.name for f in FAULTS]
     healthy = [f.name for f in FAULTS if f.name not in row["valve"]]
     blamed = any(levels[name] not in (Level.ACCEPTABLE.word, "cannot_tell") for name in healthy)
-    inside = tuple(row[f.key][1] <= true[f.name] <= row[f.key][2] for f in FAULTS)
-    return Score(all(levels[name] == wanted[name] for name in judged), blamed, (inside[0], inside[1]))
+    inside = tuple(row[f.key][1] <= true_sizes[f.name] <= row[f.key][2] for f in FAULTS)
+    return Score(all(levels[name] == true_levels[name] for name in fault_names), blamed, (inside[0], inside[1]))
 
 
 def name_valve(valve: Mapping[str, float]) -> str:
@@ -163,15 +164,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=1, help="units of each kind")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="of the first case")
     parser.add_argument("--signals", default=",".join(SIGNALS), help="what is measured (default: xj,p12,xs)")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
 
     def show(progress: BatchProgress) -> None:
         row = progress.row
         print(f"{progress.done} of {progress.total}: {name_valve(row.get('valve', {}))}, {row.get('other')}: "
               f"{row['verdict']} {' '.join(row.get('effects', ()))}", flush=True)
 
-    jobs = list_jobs(given.repeats, given.seed)[:given.most]
-    print(format_table(run_study(jobs, given.out, show, given.signals.split(","))))
+    jobs = list_jobs(options.repeats, options.seed)[:options.most]
+    print(format_table(run_study(jobs, options.out, show, options.signals.split(","))))
     return 0
 
 

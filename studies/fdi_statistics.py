@@ -22,12 +22,12 @@ def format_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "".join("| " + " | ".join(line) + " |\n" for line in lines) + "\n"
 
 
-def format_rates(found: Sequence[Mapping[str, Any]]) -> str:
+def format_rates(rates: Sequence[Mapping[str, Any]]) -> str:
     """The required rates as a table."""
     return format_table(("", "count", "share", "95 % interval", "required", ""),
                         [(r["name"].strip(), *show_share(r["share"]),
                           format_requirement(100 * r["least"], 100 * r["most"]), MET[r["met"]])
-                         for r in found if r["share"]["of"]])
+                         for r in rates if r["share"]["of"]])
 
 
 def format_tolerance(figures: Mapping[str, Any]) -> str:
@@ -43,12 +43,12 @@ def format_tolerance(figures: Mapping[str, Any]) -> str:
                                   *(show_share(p[key])[1] for key in ("most", "ruling", "bands"))) for p in points])
     for fault in FAULTS:
         counts = figures["levels"][fault.name]
-        said = [word for word in next(iter(counts.values())) if any(row[word] for row in counts.values())]
-        out += format_table((f"{fault.symbol}: true level, reported", *said),
-                     [(name, *(str(row[word]) for word in said)) for name, row in counts.items() if any(row.values())])
-    said = sorted({word for row in figures["ruling"].values() for word in row})
-    out += format_table(("ruling fault: truth, reported", *said),
-                 [(name, *(str(row.get(word, 0)) for word in said)) for name, row in figures["ruling"].items()])
+        words = [word for word in next(iter(counts.values())) if any(row[word] for row in counts.values())]
+        out += format_table((f"{fault.symbol}: true level, reported", *words),
+                     [(name, *(str(row[word]) for word in words)) for name, row in counts.items() if any(row.values())])
+    words = sorted({word for row in figures["ruling"].values() for word in row})
+    out += format_table(("ruling fault: truth, reported", *words),
+                 [(name, *(str(row.get(word, 0)) for word in words)) for name, row in figures["ruling"].items()])
     return out + format_table(
         ("plant", "estimate of", "cases", "bias", "RMS error", "95 % within", "truth in its interval", "95 % interval"),
         [(e["label"](next(f for f in FAULTS if f.name == e["fault"])), str(e["cases"]),

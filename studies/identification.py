@@ -89,17 +89,17 @@ def judge_unit(seed: int, workers: int | None = None) -> dict[str, Any]:
     unit, model = simulate_unit(seed), load_model()
     ranges = read_free_parameters(model, None)
     runs = read_identification_runs(model, ranges, unit.fitted, [unit.held_out])
-    found = identify_model(runs.model, ranges, runs.fitted, runs.held_out, runs.sources, workers=workers)
+    identification = identify_model(runs.model, ranges, runs.fitted, runs.held_out, runs.sources, workers=workers)
     truth = unit.values
     rows = {e.name: {"true": truth[e.name], "value": e.value, "low": e.low, "high": e.high,
                      "identifiable": e.is_identifiable, "inside": e.low <= truth[e.name] <= e.high}
-            for e in found.estimates}
-    return {"seed": seed, "verdict": found.verdict, "parameters": rows,
-            "gain_error": found.model[GAIN] / truth[GAIN] - 1.0,
-            "fitted": max(e.ratio for e in found.errors if not e.is_held_out),
-            "held_out": max(e.ratio for e in found.holdouts),
-            "decided": max(e.decided_ratio for e in found.holdouts),
-            "undecided": max(e.undecided for e in found.holdouts)}
+            for e in identification.estimates}
+    return {"seed": seed, "verdict": identification.verdict, "parameters": rows,
+            "gain_error": identification.model[GAIN] / truth[GAIN] - 1.0,
+            "fitted": max(e.ratio for e in identification.errors if not e.is_held_out),
+            "held_out": max(e.ratio for e in identification.holdouts),
+            "decided": max(e.decided_ratio for e in identification.holdouts),
+            "undecided": max(e.undecided for e in identification.holdouts)}
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -109,23 +109,24 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
              "|---|---|---|---|---|"]
     total, good = 0, 0
     for name in names:
-        seen = [p for row in rows if (p := row["parameters"][name])["identifiable"]]
-        inside = sum(p["inside"] for p in seen)
-        total, good = total + len(seen), good + inside
-        half = _find_median([(p["high"] - p["low"]) / 2 / p["value"] for p in seen])
-        error = _find_median([abs(p["value"] / p["true"] - 1) for p in seen])
-        lines.append(f"| {name} | {len(seen)} of {len(rows)} | {inside} of {len(seen)} | {100 * half:.2g} % | "
-                     f"{100 * error:.2g} % |")
+        estimates = [p for row in rows if (p := row["parameters"][name])["identifiable"]]
+        inside = sum(p["inside"] for p in estimates)
+        total, good = total + len(estimates), good + inside
+        half = _find_median([(p["high"] - p["low"]) / 2 / p["value"] for p in estimates])
+        error = _find_median([abs(p["value"] / p["true"] - 1) for p in estimates])
+        lines.append(f"| {name} | {len(estimates)} of {len(rows)} | {inside} of {len(estimates)} | "
+                     f"{100 * half:.2g} % | {100 * error:.2g} % |")
     share = measure_share(good, total)
     whole = sum(all(p["inside"] for p in row["parameters"].values() if p["identifiable"]) for row in rows)
-    held, decided = (sorted(row[key] for row in rows) for key in ("held_out", "decided"))
+    ratios, decided_ratios = (sorted(row[key] for row in rows) for key in ("held_out", "decided"))
     words = sorted({row["verdict"] for row in rows})
     verdicts = ", ".join(f"{word} {sum(row['verdict'] == word for row in rows)}" for word in words)
     lines += ["", f"All parameters: {good} of {total} intervals hold the true value ({100 * share.value:.1f} %, "
               f"{100 * share.low:.1f} .. {100 * share.high:.1f}); in {whole} of {len(rows)} trials all of them do. "
-              f"Held-out error: median {held[len(held) // 2]:.3f}, largest {held[-1]:.3f} noise floors; "
-              f"{sum(x <= 1.1 for x in held)} of {len(held)} at most 1.1; without the rows that no model can predict "
-              f"{sum(x <= 1.1 for x in decided)}, largest {decided[-1]:.3f}. Verdicts: {verdicts}."]
+              f"Held-out error: median {ratios[len(ratios) // 2]:.3f}, largest {ratios[-1]:.3f} noise floors; "
+              f"{sum(x <= 1.1 for x in ratios)} of {len(ratios)} at most 1.1; without the rows that no model can "
+              f"predict {sum(x <= 1.1 for x in decided_ratios)}, largest {decided_ratios[-1]:.3f}. "
+              f"Verdicts: {verdicts}."]
     return "\n".join(lines)
 
 

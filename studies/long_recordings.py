@@ -66,8 +66,8 @@ def record_unit(com: Floats, seed: int) -> Trace:
              for x, name in zip(noise, ("position", "pressure", "spool"), strict=True)]
     run = Lanes(model, list(sizes), 100).closed_loop(values, com - noise[0], np.zeros(len(com)))[0].T
     columns = {EHA.command.name: com, "load": np.zeros(len(com))}
-    for column, x, shown, digits in zip(EHA.columns, run, (noise[0], 0.0, *noise[1:]), (7, 8, 0, 8), strict=True):
-        columns[column.name] = np.round(x + shown, digits)
+    for column, x, offset, digits in zip(EHA.columns, run, (noise[0], 0.0, *noise[1:]), (7, 8, 0, 8), strict=True):
+        columns[column.name] = np.round(x + offset, digits)
     return Trace.from_columns(columns, 1e-3, {})
 
 
@@ -76,9 +76,9 @@ def _measure_cost(command: str, length: float, file: Path) -> dict[str, Any]:
     process = subprocess.Popen([sys.executable, "-m", "rig.cli.main", command, str(file), "--json"],
                                stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     answer = process.stdout.read() if process.stdout else b""
-    _, _, used = os.wait4(process.pid, 0)
-    return {"command": command, "length": length, "cpu": used.ru_utime + used.ru_stime,
-            "memory": 1024 * used.ru_maxrss, "verdict": str(json.loads(answer)["verdict"])}
+    _, _, usage = os.wait4(process.pid, 0)
+    return {"command": command, "length": length, "cpu": usage.ru_utime + usage.ru_stime,
+            "memory": 1024 * usage.ru_maxrss, "verdict": str(json.loads(answer)["verdict"])}
 
 
 def build_long_recordings_report(figures: Mapping[str, Any]) -> Report:

@@ -70,15 +70,15 @@ def draw_ramps(traces: Mapping[str, Trace], number: int = 0) -> str:
         return to_svg(figure, "ramps")
 
 
-def draw_bands(excursions: list[Excursion], shown: Mapping[str, Sequence[float]], bands: Bands, trace: Trace, kind: str,
-               signal: str) -> str:
+def draw_bands(excursions: list[Excursion], frictions: Mapping[str, Sequence[float]], bands: Bands, trace: Trace,
+               kind: str, signal: str) -> str:
     """Figs. 10 (step, position), 11 (ramp, position) and 12 (ramp, speed): a trace in the bands.
 
     A step is drawn with the healthy response and its limits, a ramp as its departure from the healthy centre.
 
     Args:
         excursions: of the trace, from `fdi.diagnosis.bands.find_excursions`; positive is towards the fault.
-        shown: frictions that the ramps show, from `find_excursions` too.
+        frictions: shown by the ramps, from `find_excursions` too.
         bands: the bands that the trace left.
         trace: the trace of the excursions.
         kind: of the sections, "step" or "ramp".
@@ -87,16 +87,16 @@ def draw_bands(excursions: list[Excursion], shown: Mapping[str, Sequence[float]]
     Returns:
         SVG, or "" where there is no such section.
     """
-    chosen = [e for e in excursions if e.section.kind == kind and e.signal == signal and e.is_judged]
-    if not chosen:
+    excursions = [e for e in excursions if e.section.kind == kind and e.signal == signal and e.is_judged]
+    if not excursions:
         return ""
     with rc_context(STYLE):
         figure = Figure(figsize=(9, 3.2), layout="constrained")
-        axes = figure.subplots(1, len(chosen), sharey=kind == "ramp", squeeze=False)[0]
-        for ax, e in zip(axes, chosen, strict=True):
+        axes = figure.subplots(1, len(excursions), sharey=kind == "ramp", squeeze=False)[0]
+        for ax, e in zip(axes, excursions, strict=True):
             if kind == "step":
                 band = _find_step_band(bands, trace, e)
-                _draw_step_in_band(ax, trace, e, band, band.compute_centres(shown, bands)[0][0])
+                _draw_step_in_band(ax, trace, e, band, band.compute_centres(frictions, bands)[0][0])
             else:
                 _draw_ramp_in_band(ax, trace, e)
             size = (e.section.last - e.section.first) * 1e3
@@ -117,13 +117,13 @@ def _draw_step_in_band(ax: Axes, trace: Trace, e: Excursion, band: StepBand, cen
     """Position near a step's end, the healthy response with the measured friction, and the limits where they apply."""
     rows = slice(e.start, e.start + len(e.departure))
     t, x = (trace.t[rows] - trace.t[e.section.start]) * 1e3, trace.xj[rows] * 1e3
-    held = np.isfinite(e.departure)
+    has_limits = np.isfinite(e.departure)
     healthy = np.interp(t * 1e-3, band.t, centre) * 1e3
     side = np.sign(np.interp(t * 1e-3, band.t, band.middle[e.fault])) * 1e3
     ax.plot(t, healthy, color=GREEN, lw=1.0, label="healthy")
     ax.plot(t, x, color=INK, lw=1.0, label="measured")
     for limit, colour, label in ((e.middle, AMBER, "MidBand"), (e.most, RED, "MaxBand")):
-        ax.plot(t, np.where(held, healthy + side * limit, np.nan), color=colour, lw=1.6, label=label)
+        ax.plot(t, np.where(has_limits, healthy + side * limit, np.nan), color=colour, lw=1.6, label=label)
     with np.errstate(invalid="ignore"):
         beyond = np.where(e.departure > e.middle, x, np.nan)
     ax.plot(t, beyond, color=RED, lw=3.5, alpha=0.5, label="outside")

@@ -136,11 +136,11 @@ def measure_sizes(fault: Fault, true: Floats, rng: np.random.Generator) -> tuple
     """The sizes that `rig fdi` would give for true sizes, (n,), in traces of one unit."""
     error = ERRORS[fault.name]
     sigma = error.base + error.share * true
-    own = rng.standard_normal()
-    noise = np.sqrt(error.common) * own + np.sqrt(1.0 - error.common) * rng.standard_normal(len(true))
-    found = np.maximum(true + sigma * noise, 0.0)  # neither size can be less
-    half = INTERVAL_95_SD * (error.base + error.share * found)
-    return tuple(Estimate(float(x), max(float(x - h), 0.0), float(x + h)) for x, h in zip(found, half, strict=True))
+    unit_noise = rng.standard_normal()
+    noise = np.sqrt(error.common) * unit_noise + np.sqrt(1.0 - error.common) * rng.standard_normal(len(true))
+    sizes = np.maximum(true + sigma * noise, 0.0)  # neither size can be less
+    half = INTERVAL_95_SD * (error.base + error.share * sizes)
+    return tuple(Estimate(float(x), max(float(x - h), 0.0), float(x + h)) for x, h in zip(sizes, half, strict=True))
 
 
 Predict = Callable[[Unit, int], "Prediction"]
@@ -201,16 +201,18 @@ def score_unit(unit: Unit, predict: Predict = predict_unit, every: int = 2) -> S
     start = unit.t[with_trend[0] - 1]
     good = [n for n in with_trend if _probability_within(predictions[n].most, time_left(n), ALPHA * end) >= BETA]
     evaluated = [max(n for n in counts if unit.t[n - 1] <= start + x * (end - start) + 1e-9) for x in LAMBDAS]
-    drawn = [(n, predictions[n].most, time_left(n)) for n in evaluated]
+    forecasts = [(n, predictions[n].most, time_left(n)) for n in evaluated]
     return Score(
         unit.law,
-        alpha_lambda=tuple(float(_probability_within(most, left, ALPHA * left) >= BETA) for _, most, left in drawn),
+        alpha_lambda=tuple(float(_probability_within(most, truth, ALPHA * truth) >= BETA)
+                           for _, most, truth in forecasts),
         horizon=time_left(good[0]) / life if good else 0.0,
-        relative=tuple(1.0 - abs(float(np.median(most)) - left) / left for _, most, left in drawn),
+        relative=tuple(1.0 - abs(float(np.median(most)) - truth) / truth for _, most, truth in forecasts),
         held_middle=tuple(_is_covered(predictions[n].middle, middle - unit.t[n - 1]) for n in evaluated),
-        held_most=tuple(_is_covered(most, left) for _, most, left in drawn),
-        width=tuple((high - low) / left for left, (low, high) in ((left, _interval(most)) for _, most, left in drawn)),
-        below=tuple(float(_interval(most)[0] > left) for _, most, left in drawn),
+        held_most=tuple(_is_covered(most, truth) for _, most, truth in forecasts),
+        width=tuple((high - low) / truth
+                    for truth, (low, high) in ((truth, _interval(most)) for _, most, truth in forecasts)),
+        below=tuple(float(_interval(most)[0] > truth) for _, most, truth in forecasts),
         latency=(start - unit.onset) / life)
 
 
@@ -220,20 +222,20 @@ def has_false_trend(seed: int) -> bool:
     return fit_trend(unit.fault, list(unit.t), unit.sizes).verdict == "TREND"
 
 
-def _probability_within(drawn: Floats, truth: float, bound: float) -> float:
+def _probability_within(times: Floats, truth: float, bound: float) -> float:
     """The share of the drawn times within the truth +- bound."""
-    return float((np.abs(drawn - truth) <= bound).mean())
+    return float((np.abs(times - truth) <= bound).mean())
 
 
-def _interval(drawn: Floats) -> tuple[float, float]:
+def _interval(times: Floats) -> tuple[float, float]:
     """The 95 % interval of the drawn times."""
-    low, high = np.quantile(drawn, [0.025, 0.975], method="nearest")
+    low, high = np.quantile(times, [0.025, 0.975], method="nearest")
     return float(low), float(high)
 
 
-def _is_covered(drawn: Floats, truth: float) -> float:
+def _is_covered(times: Floats, truth: float) -> float:
     """1.0 if the 95 % interval contains the truth, else 0.0; NaN for a time that has passed."""
-    low, high = _interval(drawn)
+    low, high = _interval(times)
     return np.nan if truth <= 0.0 else float(low <= truth <= high)
 
 

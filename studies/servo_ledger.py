@@ -109,8 +109,8 @@ def make_ledger(traces: Mapping[str, Trace]) -> list[LedgerRow]:
         signal = step.signal
         model = model.replace(tie_values({**step.fixed, **{name: bounds.first for name, bounds in step.free.items()}}))
         starts = [model.replace({name: value}) for name, values in step.grid.items() for value in values]
-        fitted = [fit_values(start, traces[FITTED], free, signal) for start in starts or [model]]
-        model = min(fitted, key=lambda m: measure_errors(m, {FITTED: traces[FITTED]})[FITTED][signal])
+        models = [fit_values(start, traces[FITTED], free, signal) for start in starts or [model]]
+        model = min(models, key=lambda m: measure_errors(m, {FITTED: traces[FITTED]})[FITTED][signal])
         rows.append(LedgerRow(step, model, measure_errors(model, traces)))
         print_row(rows[-1])
     return rows
@@ -130,13 +130,13 @@ def fit_values(model: Model, trace: Trace, free: Mapping[str, Bounds], signal: s
     scale = np.array([abs(bounds.first) for bounds in free.values()])
     low, high = (np.array([bounds[i] for bounds in free.values()]) / scale for i in (1, 2))
     lanes = Lanes(silence_sensors(model), names, CYCLE_STEPS)
-    measured, column = trace.mask_unusable(signal), trace.output_names.index(signal)
+    measurement, column = trace.mask_unusable(signal), trace.output_names.index(signal)
 
     def compute_rows(x: Floats) -> Floats:
-        given = [tie_values(dict(zip(free, row * scale, strict=True))) for row in x]
-        values = np.array([[row[name] for name in names] for row in given])
-        left = replay_lanes(lanes, values, trace)[..., column] - measured
-        return np.nan_to_num(left) / UNITS[signal]
+        parameters = [tie_values(dict(zip(free, row * scale, strict=True))) for row in x]
+        values = np.array([[row[name] for name in names] for row in parameters])
+        residual = replay_lanes(lanes, values, trace)[..., column] - measurement
+        return np.nan_to_num(residual) / UNITS[signal]
 
     def compute_jacobian(x: Floats) -> Floats:
         size = np.where(x + DIFFERENCE > high, -DIFFERENCE, DIFFERENCE)
@@ -145,9 +145,9 @@ def fit_values(model: Model, trace: Trace, free: Mapping[str, Bounds], signal: s
         return slopes
 
     start = np.clip(np.array([model[name] for name in free]) / scale, low + 1e-6, high - 1e-6)
-    found = least_squares(lambda x: compute_rows(x[None])[0], start, compute_jacobian, (low, high), max_nfev=20,
-                          ftol=3e-5, xtol=3e-5)
-    values = {name: float(f"{v:.4g}") for name, v in zip(free, found.x * scale, strict=True)}
+    fit = least_squares(lambda x: compute_rows(x[None])[0], start, compute_jacobian, (low, high), max_nfev=20,
+                        ftol=3e-5, xtol=3e-5)
+    values = {name: float(f"{v:.4g}") for name, v in zip(free, fit.x * scale, strict=True)}
     return model.replace(tie_values(values))
 
 
@@ -155,10 +155,10 @@ def measure_errors(model: Model, traces: Mapping[str, Trace]) -> dict[str, dict[
     """RMS residual of each run: xj m, p12 Pa, and "alone": xj from the motor's speed without measured pressures, m."""
     out = {}
     for name, trace in traces.items():
-        left = compute_residuals(trace, replay_current(trace, model, CYCLE_STEPS))
+        residuals = compute_residuals(trace, replay_current(trace, model, CYCLE_STEPS))
         alone = replace(trace, chambers=None)
         free = compute_residuals(alone, replay_current(alone, model, CYCLE_STEPS))
-        out[name] = {signal: rms(values) for signal, values in left.items()} | {"alone": rms(free["xj"])}
+        out[name] = {signal: rms(values) for signal, values in residuals.items()} | {"alone": rms(free["xj"])}
     return out
 
 
@@ -176,24 +176,24 @@ def write_model(rows: Sequence[LedgerRow], trace: Path, out: Path) -> None:
     ledger = tuple(Row(row.step.effect if row.step else None, {name: row.errors[FITTED][name] for name in UNITS}, {})
                    for row in rows)
     source = read_source(str(trace))._replace(file=trace.name)
-    known = Provenance(name_software(), ("python -m studies.servo_ledger FOLDER",), (), signals=tuple(UNITS),
-                       trace=source, ledger=ledger)
-    out.write_text(HEAD + format_model_file(model, {}, known), encoding="utf-8")
+    provenance = Provenance(name_software(), ("python -m studies.servo_ledger FOLDER",), (), signals=tuple(UNITS),
+                            trace=source, ledger=ledger)
+    out.write_text(HEAD + format_model_file(model, {}, provenance), encoding="utf-8")
 
 
 def identify_controller(files: Mapping[str, Path]) -> float:
     """Print the law of the rig's firmware from each run; by what fraction it is stronger back than out in FITTED."""
     print("\n| run | gain out | gain back | delay, rows | left, RMS | answer, RMS | exact |")
     print("|---" * 7 + "|")
-    found = {}
+    asymmetries = {}
     for run, file in files.items():
         columns = np.loadtxt(file, delimiter=";", skiprows=1 + START_UP, usecols=(9, 13, 14, 16))
         answer, demand, position, valve = columns.T
         law = fit_directional_gains(demand - position, answer, valve)
         print(f"| {run} | {law.out:.3f} | {law.back:.3f} | {law.delay} | {law.residual:.1f} | {law.answer:.0f} "
               f"| {100 * law.exact:.0f} % |")
-        found[run] = law.asymmetry
-    return found[FITTED]
+        asymmetries[run] = law.asymmetry
+    return asymmetries[FITTED]
 
 
 class DirectionalGains(NamedTuple):
@@ -225,7 +225,7 @@ def fit_directional_gains(error: Floats, answer: Floats, side: Floats, longest_d
         ValueError: a side without rows.
     """
     return min((_fit_at_delay(error, answer, side, delay) for delay in range(longest_delay + 1)),
-               key=lambda found: found.residual)
+               key=lambda law: law.residual)
 
 
 def _fit_at_delay(error: Floats, answer: Floats, side: Floats, delay: int) -> DirectionalGains:
@@ -235,10 +235,10 @@ def _fit_at_delay(error: Floats, answer: Floats, side: Floats, delay: int) -> Di
         if not np.any(e[rows]):
             raise ValueError(f"rows with an error while the actuator is driven {name}")
     gain = {name: float(e[rows] @ y[rows] / (e[rows] @ e[rows])) for name, rows in ways.items()}
-    left = np.concatenate([y[rows] - gain[name] * e[rows] for name, rows in ways.items()])
+    residual = np.concatenate([y[rows] - gain[name] * e[rows] for name, rows in ways.items()])
     whole = np.concatenate([y[rows] - round(gain[name]) * e[rows] for name, rows in ways.items()])
     driven = y[ways["out"] | ways["back"]]
-    return DirectionalGains(gain["out"], gain["back"], delay, rms(left), rms(driven),
+    return DirectionalGains(gain["out"], gain["back"], delay, rms(residual), rms(driven),
                             float(np.mean(np.abs(whole) <= 0.5)))
 
 
@@ -252,9 +252,9 @@ def draw_steps(rows: Sequence[LedgerRow], trace: Trace, folder: Path) -> None:
         with start_figure(2.2, 8.0) as figure:
             axes = figure.subplots()
             for row, colour, label in ((before, COMMAND, "before"), (after, GREEN, "after")):
-                left = compute_residuals(trace, replay_current(trace, row.model, CYCLE_STEPS))[signal]
-                whole = len(left) // BLOCK * BLOCK
-                blocks = np.sqrt(np.mean(left[:whole].reshape(-1, BLOCK) ** 2, axis=1))
+                residual = compute_residuals(trace, replay_current(trace, row.model, CYCLE_STEPS))[signal]
+                whole = len(residual) // BLOCK * BLOCK
+                blocks = np.sqrt(np.mean(residual[:whole].reshape(-1, BLOCK) ** 2, axis=1))
                 axes.plot(trace.t[:whole:BLOCK], factor * blocks, color=colour, lw=1.2, label=label)
             axes.set(title=f"{number}. {after.step.title}", xlabel="t [s]",
                      ylabel=f"{trace.declared.find(signal).symbol} [{unit}]")

@@ -36,14 +36,14 @@ def list_cases(model: Model, faults: Sequence[Fault], seeds: int, healthy: int, 
 
 def count_answers(rows: Iterable[Row], faults: Sequence[Fault]) -> dict[str, dict[str, Share]]:
     """Shares by fault, and over all of them: named, grouped, right level, another fault reported, size in interval."""
-    counted: dict[str, dict[str, list[bool]]] = {}
+    answers: dict[str, dict[str, list[bool]]] = {}
     for row in rows:
         name = row["label"].partition("=")[0]
         for word, is_so in _judge_row(row, name, faults):
             for group in (name, "all") if name != HEALTHY else (name,):
-                counted.setdefault(group, {}).setdefault(word, []).append(is_so)
-    return {name: {word: measure_share(sum(found), len(found)) for word, found in words.items()}
-            for name, words in counted.items()}
+                answers.setdefault(group, {}).setdefault(word, []).append(is_so)
+    return {name: {word: measure_share(sum(hits), len(hits)) for word, hits in words.items()}
+            for name, words in answers.items()}
 
 
 def _judge_row(row: Row, name: str, faults: Sequence[Fault]) -> Iterator[tuple[str, bool]]:
@@ -65,12 +65,12 @@ def _judge_row(row: Row, name: str, faults: Sequence[Fault]) -> Iterator[tuple[s
 
 def format_table(shares: Mapping[str, Mapping[str, Share]]) -> str:
     """The shares in Markdown, with 95 % intervals in the line of all."""
-    words = list(dict.fromkeys(word for found in shares.values() for word in found))
+    words = list(dict.fromkeys(word for row in shares.values() for word in row))
     lines = [f"| fault | {' | '.join(words)} |", "|---" * (len(words) + 1) + "|"]
-    for name, found in shares.items():
-        cells = [f"{found[w].good}/{found[w].of}" + (
-            f" ({100 * found[w].low:.0f} .. {100 * found[w].high:.0f} %)" if name in ("all", HEALTHY) else "")
-            if w in found else "" for w in words]
+    for name, row in shares.items():
+        cells = [f"{row[w].good}/{row[w].of}" + (
+            f" ({100 * row[w].low:.0f} .. {100 * row[w].high:.0f} %)" if name in ("all", HEALTHY) else "")
+            if w in row else "" for w in words]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -45,7 +45,7 @@ def format_minima(name: str, drive: str, trace: Trace) -> str:
 
 def format_scatter(kintas: float, fss: float, command: np.ndarray) -> str:
     """Mean and standard deviation of the errors under 1.5 % scatter of every base parameter, as a row of the table."""
-    nominal, found = Model(), []
+    nominal, sizes = Model(), []
     tolerances = [name for name in nominal.list_names() if nominal.kind.parameters[name.split(".")[0]].__name__ not in (
         "Controller", "Sensors") and name not in ("filter.clogging", "filter.law") and "friction" not in name]
     for seed in range(SCATTERED):
@@ -54,9 +54,9 @@ def format_scatter(kintas: float, fss: float, command: np.ndarray) -> str:
         unit = unit.replace({"filter.clogging": kintas, "spool.static_friction": fss,
                              "spool.dynamic_friction": fss / 1.5})
         g = search_grid(Trace.from_columns(simulate(unit, command, seed=seed)._asdict(), 1e-3, {}))
-        found.append([*g.merged.sizes, *g.joint.minimum.sizes, *g.best.sizes])
-    off = np.array(found) - [kintas, fss, kintas, fss, kintas, fss]
-    mean, sd = off.mean(0), off.std(0, ddof=1)
+        sizes.append([*g.merged.sizes, *g.joint.minimum.sizes, *g.best.sizes])
+    errors = np.array(sizes) - [kintas, fss, kintas, fss, kintas, fss]
+    mean, sd = errors.mean(0), errors.std(0, ddof=1)
     cells = [f"{mean[i]:+.3f} ± {sd[i]:.3f}, {mean[i + 1]:+.1f} ± {sd[i + 1]:.1f} N" for i in (0, 2, 4)]
     return f"| {kintas:g}, {fss:g} N | {' | '.join(cells)} |"
 
@@ -77,9 +77,9 @@ def main() -> None:
     save("8", figures.draw_ramps({"healthy": healthy} | stiff))
     case = cases["14"]
     bands = choose_bands(case.com, case.load, case.period, None, lambda *_: None)
-    found, shown, _ = find_excursions(case.com, case.xj, case.period, bands, case.sections())
+    excursions, frictions, _ = find_excursions(case.com, case.xj, case.period, bands, case.sections())
     for number, kind, signal in (("10", "step", "position"), ("11", "ramp", "position"), ("12", "ramp", "speed")):
-        save(number, figures.draw_bands(found, shown, bands, case, kind, signal))
+        save(number, figures.draw_bands(excursions, frictions, bands, case, kind, signal))
     for number, trace in cases.items():
         save(number, draw_maps(search_grid(trace), CASES[number]))
         for drive in ("current", "command"):

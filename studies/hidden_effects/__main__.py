@@ -63,10 +63,10 @@ def score_method(folder: Path, method: str, workers: int) -> tuple[Report, bool]
     truths = read_truths(folder)
     answers = read_answers(file, truths)
     scores = score_answers(truths, answers)
-    missed = [rate["name"] for rate in scores["rates"] if rate["of"] and rate["share"] < AIMS.get(rate["name"], 0.0)]
-    sentence = f"Below the aim: {'; '.join(missed)}." if missed else "Every aim that was counted is reached."
+    misses = [rate["name"] for rate in scores["rates"] if rate["of"] and rate["share"] < AIMS.get(rate["name"], 0.0)]
+    sentence = f"Below the aim: {'; '.join(misses)}." if misses else "Every aim that was counted is reached."
     return Report("bench", f"hidden effects by {method}", sentence=sentence, data=scores, sections=[
-        Section("Scores", [Listing(format_scores(scores, truths, answers))])]), not missed
+        Section("Scores", [Listing(format_scores(scores, truths, answers))])]), not misses
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -75,19 +75,20 @@ def sample_case(plant: str, seed: int) -> Case:
     is_white = rng.random() < 1 / 3
     colour, hum = float(rng.uniform(0.6, 0.85)), float(rng.uniform(0.3e-6, 1.1e-6))
     outside = list_outside_effects(plant)
-    own = [e for e in list_searched_effects(plant) if not e.disturbance and ensure_starts(e.name, command, None, plant)]
-    own = [e for e in own if e not in outside]
-    pool, count = (outside, 1) if kind_of == "outside" else (own, {"nothing": 0, "one": 1, "two": 2}[kind_of])
+    candidates = [e for e in list_searched_effects(plant)
+                  if not e.disturbance and ensure_starts(e.name, command, None, plant)]
+    candidates = [e for e in candidates if e not in outside]
+    pool, count = (outside, 1) if kind_of == "outside" else (candidates, {"nothing": 0, "one": 1, "two": 2}[kind_of])
     while True:
-        chosen = [pool[int(i)] for i in rng.choice(len(pool), count, replace=False)] if count else []
-        if not any(a.name in b.excludes for a in chosen for b in chosen):
+        effects = [pool[int(i)] for i in rng.choice(len(pool), count, replace=False)] if count else []
+        if not any(a.name in b.excludes for a in effects for b in effects):
             break
     low, high = LEVELS.get(kind_of, (1.0, 1.0))
-    hidden = tuple((e.name, sample_size(plant, e, command, low * (high / low) ** float(rng.random()), rng))
-                   for e in chosen)
+    hidden_effects = tuple((e.name, sample_size(plant, e, command, low * (high / low) ** float(rng.random()), rng))
+                           for e in effects)
     outputs = [s.name for s in kind.signals.outputs]
-    measured = len(outputs) if rng.random() < 0.5 else int(rng.integers(1, len(outputs) + 1))
-    return Case(seed, kind_of, hidden, ",".join(outputs[:measured]), scatter, 0.0 if is_white else colour,
+    output_count = len(outputs) if rng.random() < 0.5 else int(rng.integers(1, len(outputs) + 1))
+    return Case(seed, kind_of, hidden_effects, ",".join(outputs[:output_count]), scatter, 0.0 if is_white else colour,
                 0.0 if is_white else hum)
 
 
@@ -104,9 +105,9 @@ def sample_size(plant: str, effect: Effect, command: Array, level: float, rng: n
     side = np.sign(start[first] - off)
     sizes = side * max(side * (each[first] - off) for each in starts) * np.geomspace(1e-3, 1.0, 37)
     healthy = HEALTHY_TOLERANCES * kind.find_tolerance(first, q) * abs(off)
-    tried = [start | {first: off + float(x)} for x in sizes if abs(x) > healthy and not q.refuses(off + x)]
-    shown = np.array([max(levels.values()) for levels in measure_levels(plant, effect, tried, command)])
-    return tried[int(np.abs(np.log(np.clip(np.nan_to_num(shown, nan=np.inf), 1e-9, 1e12) / level)).argmin())]
+    candidates = [start | {first: off + float(x)} for x in sizes if abs(x) > healthy and not q.refuses(off + x)]
+    peak_levels = np.array([max(levels.values()) for levels in measure_levels(plant, effect, candidates, command)])
+    return candidates[int(np.abs(np.log(np.clip(np.nan_to_num(peak_levels, nan=np.inf), 1e-9, 1e12) / level)).argmin())]
 
 
 def measure_levels(plant: str, effect: Effect, values: Sequence[Mapping[str, float]], command: Array
@@ -126,15 +127,15 @@ def measure_levels(plant: str, effect: Effect, values: Sequence[Mapping[str, flo
     change[:, LAG:, 0] -= change[:, :-LAG, 0].copy()  # the first rows are not judged
     with np.errstate(over="ignore", invalid="ignore"):  # sizes at which the simulation diverges are tried too
         change = change[:, find_judged_rows(plant, command)] / noise
-        own = change[len(values):].reshape(len(units), change[0].size)
-        found = []
+        unit_changes = change[len(values):].reshape(len(units), change[0].size)
+        level_rows = []
         for row in change[:len(values)]:
-            share = np.linalg.solve(own @ own.T + np.eye(len(units)), own @ row.ravel())
-            left = row - (np.clip(share, -HEALTHY_TOLERANCES, HEALTHY_TOLERANCES) @ own).reshape(row.shape)
-            levels = dict(zip(names, compute_typical_rms(left.T).tolist(), strict=True))
+            share = np.linalg.solve(unit_changes @ unit_changes.T + np.eye(len(units)), unit_changes @ row.ravel())
+            residual = row - (np.clip(share, -HEALTHY_TOLERANCES, HEALTHY_TOLERANCES) @ unit_changes).reshape(row.shape)
+            levels = dict(zip(names, compute_typical_rms(residual.T).tolist(), strict=True))
             none = dict.fromkeys(names, 0.0) | {"controller": levels[names[0]]}
-            found.append(none if effect.firmware else levels | {"controller": 0.0})
-    return found
+            level_rows.append(none if effect.firmware else levels | {"controller": 0.0})
+    return level_rows
 
 
 def find_judged_rows(plant: str, command: Array) -> NDArray[np.bool_]:

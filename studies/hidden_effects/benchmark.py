@@ -55,36 +55,36 @@ def make_benchmark(folder: Path, seeds: Sequence[int], signals: str | None = Non
         InputError: unknown signals or plant, no C compiler, or a folder that has other cases or cannot be written.
     """
     outputs = [s.name for s in name_plant(plant).signals.outputs]
-    known = [",".join(outputs[:count]) for count in range(1, len(outputs) + 1)]
-    chosen = signals or known[-1]
-    if chosen not in (*known, DRAWN):
-        raise InputError("--signals", chosen, " or ".join([*known, DRAWN]))
+    selections = [",".join(outputs[:count]) for count in range(1, len(outputs) + 1)]
+    selection = signals or selections[-1]
+    if selection not in (*selections, DRAWN):
+        raise InputError("--signals", selection, " or ".join([*selections, DRAWN]))
     if plant == "eha":
         truth.parameter_names()  # compile the simulator before several processes need it
-    _write_description(folder, {"plant": plant, "signals": chosen, "small": small,
+    _write_description(folder, {"plant": plant, "signals": selection, "small": small,
                                 "made_by": hash_sources(*CASE_SOURCES)})
     missing = [seed for seed in seeds if not (folder / "cases" / f"{seed:05d}").exists()]
-    clock, work = WallClock(), partial(make_case, folder=folder, signals=chosen, plant=plant, small=small)
+    clock, work = WallClock(), partial(make_case, folder=folder, signals=selection, plant=plant, small=small)
     for done, (seed, _) in enumerate(run_jobs(work, missing, Workers(processes), _raise_failure), start=1):
-        left = clock.now() * 1e-9 / done * (len(missing) - done)
-        report_progress(f"case {seed:05d} made, {done}/{len(missing)}, {format_duration(left)} left")
+        seconds_left = clock.now() * 1e-9 / done * (len(missing) - done)
+        report_progress(f"case {seed:05d} made, {done}/{len(missing)}, {format_duration(seconds_left)} left")
 
 
 def _raise_failure(seed: int, reason: str) -> None:
     raise RigError(f"case {seed:05d} could not be made: {reason}")
 
 
-def _write_description(folder: Path, made: dict[str, Any]) -> None:
+def _write_description(folder: Path, settings: dict[str, Any]) -> None:
     """Write benchmark.json and the files that do not depend on the cases. Raises InputError for another benchmark."""
     file = folder / "benchmark.json"
-    if file.exists() and not made.items() <= read_description(folder).items():
+    if file.exists() and not settings.items() <= read_description(folder).items():
         raise InputError(folder, "", "an empty folder, or one with cases of the same plant, signals and simulator")
     try:
         (folder / "truth").mkdir(parents=True, exist_ok=True)
         for source in (HERE / "README.md", HERE / "score.py", HERE.parent.parent / "docs" / "physics.md"):
             shutil.copyfile(source, folder / source.name)
-        described = made | (_describe_eha() if made["plant"] == "eha" else {})
-        file.write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
+        description = settings | (_describe_eha() if settings["plant"] == "eha" else {})
+        file.write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(folder, "", f"a folder that can be written ({error.strerror})") from None
 
@@ -106,10 +106,10 @@ def _describe_eha() -> dict[str, Any]:
 def read_description(folder: Path) -> dict[str, Any]:
     """The benchmark.json of a folder. Raises InputError where there is none."""
     try:
-        found: dict[str, Any] = json.loads((folder / "benchmark.json").read_text(encoding="utf-8"))
+        description: dict[str, Any] = json.loads((folder / "benchmark.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise InputError(folder, "", "the folder of a benchmark, which --benchmark without --answer makes") from None
-    return found
+    return description
 
 
 def make_case(seed: int, folder: Path, signals: str, plant: str, small: bool = False) -> None:
@@ -184,6 +184,6 @@ def make_row(case: str, sources: str, answer: dict[str, Any]) -> Row:
 def describe_progress(progress: BatchProgress) -> str:
     """One finished case in one line, and the time left."""
     answer = progress.row["answer"]
-    named = ", ".join(answer.get("effects") or []) or answer.get("error", "")
+    names = ", ".join(answer.get("effects") or []) or answer.get("error", "")
     return (f"{progress.done}/{progress.total}, {format_duration(progress.left)} left: "
-            f"case {progress.row['case']:05d}, {answer['verdict']} {named}, {answer.get('seconds', 0.0):.1f} s")
+            f"case {progress.row['case']:05d}, {answer['verdict']} {names}, {answer.get('seconds', 0.0):.1f} s")

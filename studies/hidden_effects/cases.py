@@ -79,28 +79,28 @@ def sample_case(seed: int, kind: str | None = None, effects: Sequence[str] = (),
     random_signals = str(rng.choice(list(SIGNALS), p=list(SIGNALS.values())))
     plant = sample_healthy_plant(bench.scatter, rng)
     low = max(sizes[0], 0.5) if kind == "two" else sizes[0]
-    drawn = tuple(hidden.sample_hidden_effect(name, nominal_symbols() | plant, rng, low, sizes[1])
-                  for name in effects or _sample_effect_names(kind, rng))
-    load = max((effect.known_load for effect in drawn), default=0.0)
+    hidden_effects = tuple(hidden.sample_hidden_effect(name, nominal_symbols() | plant, rng, low, sizes[1])
+                           for name in effects or _sample_effect_names(kind, rng))
+    load = max((effect.known_load for effect in hidden_effects), default=0.0)
     is_loaded = rng.random() < 0.1 and bench.scatter > 0  # one in ten of the cases that do not need a known load
     random_load = float(rng.uniform(2000, 8000)) if is_loaded else 0.0
-    return Case(seed, kind, drawn, signals or random_signals, bench, plant, load or random_load)
+    return Case(seed, kind, hidden_effects, signals or random_signals, bench, plant, load or random_load)
 
 
 def sample_small_case(seed: int, signals: str | None = None) -> Case:
     """A case of one of the effects that others look like, of a size that 1 to 2 noise floors show at best."""
     rng = np.random.default_rng([seed, 7])
     while True:
-        name, wanted = str(rng.choice(LOOK_ALIKE)), float(rng.uniform(1.1, 1.9))
+        name, target = str(rng.choice(LOOK_ALIKE)), float(rng.uniform(1.1, 1.9))
         low, high = -2.0, 1.0  # of the logarithmic range of sizes, which begins at about 2 floors
         for _ in range(10):  # friction that just holds a spool shows by more than 2 floors at once: another effect then
             middle = 0.5 * (low + high)
             case = sample_case(seed, effects=[name], sizes=(middle, middle), signals=signals)
             changes = measure_changes(case, measure_case(case, "est"), [name])
-            shown = max(measure_rms(changes[signal]) for signal in case.signals.split(","))
-            if abs(shown - wanted) < 0.1:
+            level = max(measure_rms(changes[signal]) for signal in case.signals.split(","))
+            if abs(level - target) < 0.1:
                 return case
-            low, high = (middle, high) if shown < wanted else (low, middle)
+            low, high = (middle, high) if level < target else (low, middle)
 
 
 def sample_healthy_plant(spread: float, rng: np.random.Generator) -> dict[str, float]:
@@ -157,12 +157,12 @@ def measure_case(case: Case, name: str) -> Measured:
     return Measured(run._replace(p12=run.p12 + noise["p12"], xs=run.xs + noise["xs"]), noise)
 
 
-def measure_changes(case: Case, measured: Measured, without: Iterable[str]) -> dict[str, Array]:
+def measure_changes(case: Case, measurement: Measured, without: Iterable[str]) -> dict[str, Array]:
     """What effects change in a trace, (n,) each, in noise floors: the trace less noise, less a replay `without` them.
 
     The replay is driven by the measured current, and has no end stops: without a bias it would drift to one.
     """
-    run, noise = measured.trace, measured.noise
+    run, noise = measurement.trace, measurement.noise
     symbols = list_changed_symbols(case, without) | {"XJM": NO_STOP}
     bare = simulate_truth(run.com, symbols, None, run.load, run.cor)
     change = measure_floors({name: getattr(run, name) - noise[name] - getattr(bare, name) for name in OUTPUTS})
@@ -211,12 +211,12 @@ def write_case(case: Case, folder: Path) -> None:
     """Write the traces and truth.json of a case into `folder`, which is made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("est", "repeat", "holdout"):
-        measured = measure_case(case, name)
-        columns = {"t": np.arange(len(measured.trace.com)) / RATE, **measured.trace._asdict()}
+        measurement = measure_case(case, name)
+        columns = {"t": np.arange(len(measurement.trace.com)) / RATE, **measurement.trace._asdict()}
         write_columns(folder / f"{name}.csv.gz", columns, case.signals)
         if name == "est":
-            truth = describe_case(case, measured)
-        noise = {signal: measure_rms(x) for signal, x in measured.noise.items()}
+            truth = describe_case(case, measurement)
+        noise = {signal: measure_rms(x) for signal, x in measurement.noise.items()}
     write_truth(folder, truth | {"holdout_noise": noise}, OUTPUTS)
 
 
@@ -241,10 +241,10 @@ def describe_case(case: Case, est: Measured) -> dict[str, Any]:
     """What is hidden in a case, and its unit, as JSON values."""
     effects = []
     for effect in case.effects:
-        shown = describe_change(measure_changes(case, est, [effect.name]), est.trace.com)
+        change = describe_change(measure_changes(case, est, [effect.name]), est.trace.com)
         parameter, unit = name_parameter(CATALOGUE.get(effect.name))
         effects.append({"name": effect.name, "parameter": parameter, "value": effect.value, "unit": unit,
-                        "size": effect.size, "symbols": effect.changes} | shown)
+                        "size": effect.size, "symbols": effect.changes} | change)
     together = measure_changes(case, est, [effect.name for effect in case.effects])
     return {"case": f"{case.seed:05d}", "plant": "eha", "kind": case.kind, "signals": case.signals, "effects": effects,
             **describe_change(together, est.trace.com), "known_load": case.load, "noise": case.level._asdict(),

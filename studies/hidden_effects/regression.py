@@ -64,24 +64,24 @@ def answer_case(case: Path, plant: str, signals: str) -> dict[str, Any]:
     candidates = list_candidates()
     traces = {name: read_columns(case / f"{name}.csv.gz") for name in ("est", "repeat", "holdout")}
     designs = {name: build_design(trace, candidates) for name, trace in traces.items()}
-    known, unseen = sum_products([designs["est"], designs["repeat"]]), sum_products([designs["holdout"]])
-    fit = fit_candidates(known, candidates, ())
+    known_sums, unseen_sums = sum_products([designs["est"], designs["repeat"]]), sum_products([designs["holdout"]])
+    fit = fit_candidates(known_sums, candidates, ())
     while len(fit.chosen) < MOST:
-        taken = {candidates[i].effect for i in fit.chosen}
-        tried = [fit_candidates(known, candidates, (*fit.chosen, i)) for i, each in enumerate(candidates)
-                 if each.effect and each.effect not in taken]
-        best = min((each for each in tried if _is_possible(candidates, each)), key=lambda each: each.bic, default=fit)
-        if best.bic >= fit.bic or measure_error(unseen, best) > GAIN * measure_error(unseen, fit):
+        effects = {candidates[i].effect for i in fit.chosen}
+        fits = [fit_candidates(known_sums, candidates, (*fit.chosen, i)) for i, each in enumerate(candidates)
+                if each.effect and each.effect not in effects]
+        best = min((each for each in fits if _is_possible(candidates, each)), key=lambda each: each.bic, default=fit)
+        if best.bic >= fit.bic or measure_error(unseen_sums, best) > GAIN * measure_error(unseen_sums, fit):
             break
         fit = best
-    words = ("nothing", "explained") if measure_error(known, fit) <= NOISE_LEFT else ("unexplained", "partly")
-    chosen = list(fit.chosen)
-    shown = {name: fit.coefficients[chosen] @ design[1:][chosen] for name, design in designs["est"].items()}
+    words = ("nothing", "explained") if measure_error(known_sums, fit) <= NOISE_LEFT else ("unexplained", "partly")
+    indices = list(fit.chosen)
+    changes = {name: fit.coefficients[indices] @ design[1:][indices] for name, design in designs["est"].items()}
     low, value, high = fit.coefficients + 1.96 * np.outer((-1.0, 0.0, 1.0), fit.errors)
-    return {"verdict": words[bool(chosen)], "effects": [candidates[i].effect for i in chosen],
+    return {"verdict": words[bool(indices)], "effects": [candidates[i].effect for i in indices],
             "sizes": {candidates[i].effect: dict(zip(("low", "value", "high"), (candidates[i].off + np.sort(
-                candidates[i].step * np.array([low[i], value[i], high[i]]))).tolist(), strict=True)) for i in chosen},
-            "where": describe_change(shown, traces["est"]["com"])["where"],
+                candidates[i].step * np.array([low[i], value[i], high[i]]))).tolist(), strict=True)) for i in indices},
+            "where": describe_change(changes, traces["est"]["com"])["where"],
             "holdout": {name: FLOORS[name] * measure_rms(design[0] - fit.coefficients @ design[1:])
                         for name, design in designs["holdout"].items() if name in ("p12", "xs")}}
 
@@ -98,17 +98,17 @@ def list_candidates() -> list[Candidate]:
     An effect with a shape, such as a frequency, is one candidate for each shape that a start has.
     """
     bare = build_bare_model("eha")
-    found = {name: Candidate("", bare[name], tolerance * bare[name], {name: (1.0 + tolerance) * bare[name]},
-                             find_quantity(name))
-             for name, tolerance in list_relative_tolerances(bare, bare.nominal).items()}
+    candidates = {name: Candidate("", bare[name], tolerance * bare[name], {name: (1.0 + tolerance) * bare[name]},
+                                  find_quantity(name))
+                  for name, tolerance in list_relative_tolerances(bare, bare.nominal).items()}
     for effect in list_searched_effects("eha"):
         for start in effect.starts:
             first, *shape = effect.fitted if not effect.base else effect.fitted[:1]
             off = effect.off.get(first, bare.nominal.get(first, 0.0))
             key = ",".join([effect.name, *(f"{start[name]:g}" for name in shape)])
             new = Candidate(effect.name, off, start[first] - off, dict(start), effect.parameters[first])
-            found[key] = min(found.get(key, new), new, key=lambda each: abs(each.step))
-    return list(found.values())
+            candidates[key] = min(candidates.get(key, new), new, key=lambda each: abs(each.step))
+    return list(candidates.values())
 
 
 def build_design(trace: dict[str, Array], candidates: list[Candidate]) -> dict[str, Array]:
@@ -139,9 +139,9 @@ def sum_products(designs: list[dict[str, Array]]) -> Moments:
     return Moments(sum((x @ x.T for x in rows), np.zeros(2 * rows[0].shape[:1])), sum(x.shape[1] for x in rows))
 
 
-def fit_candidates(sums: Moments, candidates: list[Candidate], chosen: tuple[int, ...]) -> Fit:
+def fit_candidates(sums: Moments, candidates: list[Candidate], indices: tuple[int, ...]) -> Fit:
     """Least squares with the chosen candidates and all parameters that scatter; a prior is one more row for each."""
-    free = [i for i, each in enumerate(candidates) if not each.effect or i in chosen]
+    free = [i for i, each in enumerate(candidates) if not each.effect or i in indices]
     prior = np.diag([float(not candidates[i].effect) for i in free])
     square, cross = sums.products[1:, 1:][np.ix_(free, free)] + prior, sums.products[1:, 0][free]
     inverse = np.linalg.pinv(square, hermitian=True)
@@ -149,7 +149,7 @@ def fit_candidates(sums: Moments, candidates: list[Candidate], chosen: tuple[int
     mean = float(sums.products[0, 0] - cross @ solution) / sums.rows
     coefficients, errors = np.zeros((2, len(candidates)))
     coefficients[free], errors[free] = solution, np.sqrt(np.diag(inverse) * mean)
-    return Fit(chosen, coefficients, errors, sums.rows * math.log(mean) + len(chosen) * math.log(sums.rows))
+    return Fit(indices, coefficients, errors, sums.rows * math.log(mean) + len(indices) * math.log(sums.rows))
 
 
 def measure_error(sums: Moments, fit: Fit) -> float:

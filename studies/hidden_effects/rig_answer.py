@@ -48,19 +48,19 @@ def run_rig_explain(est: Path, holdout: Path, repeats: Sequence[Path], signals: 
 
 def answer_case(case: Path, plant: str, signals: str) -> dict[str, Any]:
     """The answer, in the form of the benchmark. Raises as `run_rig_explain` does."""
-    found = run_rig_explain(case / "est.csv.gz", case / "holdout.csv.gz", [case / "repeat.csv.gz"], signals.split(","),
-                            model=plant)
-    named = {candidate["effect"]: candidate for candidate in reversed(found["candidates"])
-             if candidate["effect"] in found["effects"]}
-    best: Mapping[str, Any] = next((named[name] for name in found["effects"] if name in named), {})
-    values = {key: x["value"] for name in (best.get("effect"), *best.get("with", ())) if name in named
-              for key, x in named[name]["parameters"].items() if x["value"] is not None}
+    answer = run_rig_explain(case / "est.csv.gz", case / "holdout.csv.gz", [case / "repeat.csv.gz"], signals.split(","),
+                             model=plant)
+    candidates = {candidate["effect"]: candidate for candidate in reversed(answer["candidates"])
+                  if candidate["effect"] in answer["effects"]}
+    best: Mapping[str, Any] = next((candidates[name] for name in answer["effects"] if name in candidates), {})
+    values = {key: x["value"] for name in (best.get("effect"), *best.get("with", ())) if name in candidates
+              for key, x in candidates[name]["parameters"].items() if x["value"] is not None}
     sizes = {name: candidate["parameters"].get(find_plant(plant).find_effect(name).fitted[0], {})
-             for name, candidate in named.items()}
-    return {"verdict": VERDICTS.get(found["verdict"], found["verdict"].lower()), "effects": found["effects"],
+             for name, candidate in candidates.items()}
+    return {"verdict": VERDICTS.get(answer["verdict"], answer["verdict"].lower()), "effects": answer["effects"],
             "sizes": {name: {key: size.get(key) for key in ("value", "low", "high")} for name, size in sizes.items()},
             "where": locate_parameters(read_columns(case / "est.csv.gz"), values) if plant == "eha" else None,
-            "holdout": best.get("holdout") or found["baseline"]["holdout"]}
+            "holdout": best.get("holdout") or answer["baseline"]["holdout"]}
 
 
 def locate_parameters(trace: Mapping[str, Array], values: Mapping[str, float]) -> list[str]:

@@ -70,9 +70,9 @@ def read_answers(file: Path, cases: Iterable[str]) -> dict[str, Answer]:
     answers = answers.get("answers", answers) if isinstance(answers, dict) else answers
     if not isinstance(answers, dict) or not answers:
         raise ScoreError(f"{file}: expected an object with one entry per case")
-    known = set(cases)
+    case_names = set(cases)
     for case, answer in answers.items():
-        fault = _find_fault(answer) if case in known else "case: expected one of the benchmark"
+        fault = _find_fault(answer) if case in case_names else "case: expected one of the benchmark"
         if fault:
             raise ScoreError(f"{file}: case {case}: {fault}")
     return answers
@@ -83,8 +83,8 @@ def _find_fault(answer: Any) -> str:
     if not isinstance(answer, dict) or answer.get("verdict") not in VERDICTS:
         return "verdict: expected " + ", ".join(VERDICTS)
     for field, words in (("effects", "a list of names, the likeliest first"), ("where", "a list of signal/section")):
-        given = answer.get(field) or []
-        if not isinstance(given, list) or not all(isinstance(word, str) for word in given):
+        entry = answer.get(field) or []
+        if not isinstance(entry, list) or not all(isinstance(word, str) for word in entry):
             return f"{field}: expected {words}"
     sizes, holdout = answer.get("sizes") or {}, answer.get("holdout") or {}
     if not isinstance(sizes, dict) or not all(isinstance(size, dict) for size in sizes.values()):
@@ -164,23 +164,24 @@ def _has_verdict(*verdicts: str) -> Callable[[Truth, Answer], bool]:
 def count_rates(pairs: Mapping[str, Pair]) -> list[Rate]:
     """The rates by kind."""
     kinds = {kind: {case: pair for case, pair in pairs.items() if pair[0]["kind"] == kind} for kind in KINDS}
-    seen = {kind: {case: pair for case, pair in group.items() if is_visible(pair[0])} for kind, group in kinds.items()}
-    right = {case: pair for case, pair in seen["one"].items() if is_named(*pair)}
-    small = {case: pair for case, pair in kinds["one"].items() if case not in seen["one"]}
+    visible = {kind: {case: pair for case, pair in group.items() if is_visible(pair[0])}
+               for kind, group in kinds.items()}
+    right = {case: pair for case, pair in visible["one"].items() if is_named(*pair)}
+    small = {case: pair for case, pair in kinds["one"].items() if case not in visible["one"]}
     table: list[tuple[str, Mapping[str, Pair], Callable[[Truth, Answer], bool | None]]] = [
         ("nothing: answered nothing", kinds["nothing"], _has_verdict("nothing")),
         ("nothing: an effect is named", kinds["nothing"], is_wrong_alone),
-        ("one: named", seen["one"], is_named),
-        ("one: named alone, explained", seen["one"], is_named_alone),
-        ("one: wrong alone", seen["one"], is_wrong_alone),
+        ("one: named", visible["one"], is_named),
+        ("one: named alone, explained", visible["one"], is_named_alone),
+        ("one: wrong alone", visible["one"], is_wrong_alone),
         ("one, below 2 floors: named", small, is_named),
         ("one, below 2 floors: wrong alone", small, is_wrong_alone),
         ("one, named: true size in interval", right, is_size_covered),
         ("one, named: held-out run at most 1.15 floors", right, is_holdout_predicted),
-        ("two: both named", seen["two"], is_named),
-        ("two: wrong alone", seen["two"], is_wrong_alone),
-        ("two, named: true sizes in intervals", seen["two"], is_size_covered),
-        ("outside: unexplained or partly", seen["outside"], _has_verdict("unexplained", "partly")),
+        ("two: both named", visible["two"], is_named),
+        ("two: wrong alone", visible["two"], is_wrong_alone),
+        ("two, named: true sizes in intervals", visible["two"], is_size_covered),
+        ("outside: unexplained or partly", visible["outside"], _has_verdict("unexplained", "partly")),
         ("outside, any size: not explained", kinds["outside"], lambda _, answer: answer["verdict"] != "explained"),
         ("all: answered within 20 s", pairs,
          lambda _, answer: answer["seconds"] <= LONGEST if answer.get("seconds") is not None else None),
@@ -190,10 +191,10 @@ def count_rates(pairs: Mapping[str, Pair]) -> list[Rate]:
 
 def count_rate(name: str, pairs: Mapping[str, Pair], is_good: Callable[[Truth, Answer], bool | None]) -> Rate:
     """How many cases are good; those for which `is_good` gives None do not count."""
-    judged = {case: good for case, pair in pairs.items() if (good := is_good(*pair)) is not None}
-    count = sum(judged.values())
-    return Rate(name, count, len(judged), *compute_interval(count, len(judged)),
-                [case for case, good in judged.items() if not good])
+    outcomes = {case: good for case, pair in pairs.items() if (good := is_good(*pair)) is not None}
+    count = sum(outcomes.values())
+    return Rate(name, count, len(outcomes), *compute_interval(count, len(outcomes)),
+                [case for case, good in outcomes.items() if not good])
 
 
 def compute_interval(good: int, of: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -236,9 +237,9 @@ def score_places(pairs: Mapping[str, Pair]) -> dict[str, Any]:
     samples = [measure(draw.choices(cases, k=len(cases))) for _ in range(RESAMPLES)]
     scores: dict[str, Any] = {"cases": len(cases)}
     for name, value in measure(cases).items():
-        ranked = sorted(sample[name] for sample in samples)
-        scores[name] = {"value": value, "low": ranked[round(0.025 * RESAMPLES)],
-                        "high": ranked[round(0.975 * RESAMPLES) - 1]}
+        sample_values = sorted(sample[name] for sample in samples)
+        scores[name] = {"value": value, "low": sample_values[round(0.025 * RESAMPLES)],
+                        "high": sample_values[round(0.975 * RESAMPLES) - 1]}
     return scores
 
 
@@ -267,9 +268,9 @@ def _take_signal(cells: Iterable[str] | None, signal: str) -> list[str]:
 
 def describe_miss(case: str, truth: Truth, answer: Answer) -> str:
     """A case in one line: what is hidden and how large, and what was answered."""
-    hidden = ", ".join(f"{effect['name']} {effect['size']:.3g}" for effect in truth["effects"]) or "nothing"
+    effects = ", ".join(f"{effect['name']} {effect['size']:.3g}" for effect in truth["effects"]) or "nothing"
     floors = max(truth["floors"].values())
-    return f"{case}  {hidden} ({floors:.1f} floors) -> {answer['verdict']} {', '.join(answer.get('effects') or [])}"
+    return f"{case}  {effects} ({floors:.1f} floors) -> {answer['verdict']} {', '.join(answer.get('effects') or [])}"
 
 
 def format_scores(scores: Mapping[str, Any], truths: Mapping[str, Truth], answers: Mapping[str, Answer]) -> str:
@@ -288,11 +289,11 @@ def format_scores(scores: Mapping[str, Any], truths: Mapping[str, Truth], answer
         lines.append(f"names in a right answer to one effect: {scores['names_on_average']:.2f} on average")
     if scores["seconds"]:
         lines.append(f"time: {scores['seconds']['median']:.1f} s median, {scores['seconds']['longest']:.1f} s longest")
-    missed = {case for rate in scores["rates"] for case in rate["without"]
+    misses = {case for rate in scores["rates"] for case in rate["without"]
               if rate["name"] in ("nothing: answered nothing", "one: named", "two: both named",
                                   "outside: unexplained or partly", "outside, any size: not explained")}
     return "\n".join([*lines, "", "missed:", *(
-        describe_miss(case, truths[case], answers.get(case, {"verdict": "failed"})) for case in sorted(missed))])
+        describe_miss(case, truths[case], answers.get(case, {"verdict": "failed"})) for case in sorted(misses))])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -53,40 +53,40 @@ class Equation(NamedTuple):
 def answer_case(case: Path, plant: str, signals: str) -> dict[str, Any]:
     """The answer for a case of the EHA with all three signals, in the form of the benchmark."""
     traces = {name: read_columns(case / f"{name}.csv.gz") for name in ("est", "repeat", "holdout")}
-    written = {name: write_equations(trace) for name, trace in traces.items()}
-    found: dict[str, tuple[float, float]] = {}  # by name: share of the equation that it explains, size
+    equations = {name: write_equations(trace) for name, trace in traces.items()}
+    matches: dict[str, tuple[float, float]] = {}  # by name: share of the equation that it explains, size
     where: list[str] = []
     is_noise, is_ambiguous = True, False
-    for signal, est in written["est"].items():
-        repeat, holdout = written["repeat"][signal], written["holdout"][signal]
+    for signal, est in equations["est"].items():
+        repeat, holdout = equations["repeat"][signal], equations["holdout"][signal]
         both = est.rows & repeat.rows
         noise = measure_rms(est.left[both] - repeat.left[both]) / 2**0.5
         coefficients = fit_terms([est, repeat], holdout)
-        shown = {name: coefficients[name] * column for name, (column, *_) in est.terms.items()}
-        left = est.left - sum(shown.values()) - coefficients["state"] * est.state
-        is_noise &= measure_rms(left[est.rows]) <= NOISE_LEFT * noise
+        contributions = {name: coefficients[name] * column for name, (column, *_) in est.terms.items()}
+        residual = est.left - sum(contributions.values()) - coefficients["state"] * est.state
+        is_noise &= measure_rms(residual[est.rows]) <= NOISE_LEFT * noise
         for term, (_, positive, negative) in est.terms.items():
             names = positive if coefficients[term] >= 0.0 else negative
             if coefficients[term] and names:
                 is_ambiguous |= len(names) > 1
-                share = measure_rms(shown[term][est.rows]) / measure_rms(est.left[est.rows])
-                found |= {name: (share, coefficients[term] if name == positive[0] else math.nan) for name in names}
+                share = measure_rms(contributions[term][est.rows]) / measure_rms(est.left[est.rows])
+                matches |= {name: (share, coefficients[term] if name == positive[0] else math.nan) for name in names}
                 where += [f"{signal}/{name}" for name, s in name_sections(traces["est"]["com"]).items()
-                          if measure_rms(np.where(est.rows, shown[term], 0.0)[s.start:s.stop]) > noise]
-    effects = sorted(found, key=lambda name: -found[name][0])
+                          if measure_rms(np.where(est.rows, contributions[term], 0.0)[s.start:s.stop]) > noise]
+    effects = sorted(matches, key=lambda name: -matches[name][0])
     words = ("nothing", "ambiguous" if is_ambiguous else "explained") if is_noise else ("unexplained", "partly")
     return {"verdict": words[bool(effects)], "effects": effects, "where": sorted(set(where)),
-            "sizes": {name: {"value": find_off_value(name) + found[name][1]} for name in effects
-                      if math.isfinite(found[name][1])}}
+            "sizes": {name: {"value": find_off_value(name) + matches[name][1]} for name in effects
+                      if math.isfinite(matches[name][1])}}
 
 
-def fit_terms(known: Sequence[Equation], unseen: Equation) -> dict[str, float]:
+def fit_terms(equations: Sequence[Equation], unseen: Equation) -> dict[str, float]:
     """The coefficients of state and terms, zero of those that are not selected."""
-    names = ["state", *known[0].terms]
-    scales = np.array([1.0 / measure_rms(known[0].state), *(
+    names = ["state", *equations[0].terms]
+    scales = np.array([1.0 / measure_rms(equations[0].state), *(
         find_smallest_start(effects) if effects else 1.0 / measure_rms(column)
-        for column, effects, _ in known[0].terms.values())])
-    unit = measure_rms(np.concatenate([each.left[each.rows] for each in known]))
+        for column, effects, _ in equations[0].terms.values())])
+    unit = measure_rms(np.concatenate([each.left[each.rows] for each in equations]))
 
     def stack(each: Equation) -> Array:
         columns = np.column_stack([each.state, *(column for column, *_ in each.terms.values())])
@@ -95,16 +95,16 @@ def fit_terms(known: Sequence[Equation], unseen: Equation) -> dict[str, float]:
     def predict(values: Array) -> float:
         return measure_rms(unseen.left[unseen.rows] / unit - stack(unseen) @ values)
 
-    tried = [np.zeros(len(names))]
+    solutions = [np.zeros(len(names))]
     for threshold in THRESHOLDS:
         model = pysindy.SINDy(pysindy.STLSQ(threshold=threshold, alpha=1e-6), pysindy.IdentityLibrary())
-        x = [stack(each) for each in known]
+        x = [stack(each) for each in equations]
         with warnings.catch_warnings(action="ignore", category=UserWarning):  # that it selects no term
-            model.fit([each[:, :1] for each in x], PERIOD, [each.left[each.rows, None] / unit for each in known],
+            model.fit([each[:, :1] for each in x], PERIOD, [each.left[each.rows, None] / unit for each in equations],
                       [each[:, 1:] for each in x])
-        tried.append(model.coefficients()[0])
-    errors = [predict(values) for values in tried]
-    close = [values for values, error in zip(tried, errors, strict=True) if error <= CLOSE * min(errors)]
+        solutions.append(model.coefficients()[0])
+    errors = [predict(values) for values in solutions]
+    close = [values for values, error in zip(solutions, errors, strict=True) if error <= CLOSE * min(errors)]
     best = min(close, key=np.count_nonzero)
     return dict(zip(names, (best * scales).tolist(), strict=True))
 
@@ -174,11 +174,11 @@ def write_equations(trace: dict[str, Array]) -> dict[str, Equation]:
 
 def follow(x: Array, most: float) -> Array:
     """The flapper, a spring with damping between two stops, in the cycle after which each input (n,) is held."""
-    p, held, out = nominal_symbols(), 0.0, []
+    p, position, out = nominal_symbols(), 0.0, []
     lag = math.exp(-PERIOD * p["KF"] / p["BF"])
     for value in x.tolist():
-        held = min(max(lag * held + (1.0 - lag) * value, -most), most)
-        out.append(held)
+        position = min(max(lag * position + (1.0 - lag) * value, -most), most)
+        out.append(position)
     return np.array(out)
 
 

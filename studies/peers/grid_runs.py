@@ -61,13 +61,13 @@ def compare_grid_runs(command: Array, progress: Progress = ignore_progress, roun
     work = Work(command)
     with tempfile.TemporaryDirectory() as folder:
         progress("the RMS grid: compiling the rivals", 0.0)
-        replays, skipped = make_replays(_list_makers(work, Path(folder)))
+        replays, skipped_rivals = make_replays(_list_makers(work, Path(folder)))
         progress("the RMS grid", 0.0)
         race = race_rivals(replays, OURS, len(work.values) * len(command), rounds, _compare_maps)
     note = "another model: what the monitor leaves out is the difference"
     rivals = [rival._replace(note=note) if rival.name == REFERENCE else rival for rival in race.rivals]
     progress("the RMS grid: ProgPy", 0.0)
-    return [*rivals, *skipped, _measure_progpy(work, race)]
+    return [*rivals, *skipped_rivals, _measure_progpy(work, race)]
 
 
 def _compare_maps(errors: Array, reference: Array) -> float:
@@ -135,18 +135,18 @@ def _make_jax_replay(work: Work) -> Replay:
     numbers = jax.numpy
 
     def measure_cell(cell: Any, current: Any, position: Any) -> Any:
-        def cycle(s: Any, held: Any) -> Any:
+        def cycle(s: Any, inputs: Any) -> Any:
             xs, xj, v, sliding = s
-            drawn = xj + ANCHOR * work.h * (held[1] - xj)
-            return step_monitor(numbers, (xs, drawn, v, sliding), held[0], work.h, cell), xj
+            anchored_xj = xj + ANCHOR * work.h * (inputs[1] - xj)
+            return step_monitor(numbers, (xs, anchored_xj, v, sliding), inputs[0], work.h, cell), xj
 
         zero = numbers.zeros(())
         xj = jax.lax.scan(cycle, (zero, position[0], zero, zero), (current, position))[1]
         return numbers.sqrt(numbers.mean((xj - position) ** 2))
 
-    compiled = jax.jit(jax.vmap(measure_cell, (0, None, None)))
+    measure_cells = jax.jit(jax.vmap(measure_cell, (0, None, None)))
     cell_columns, acting = Cell(*work.cells()), np.r_[0.0, work.current[:-1]]
-    return lambda: np.asarray(compiled(cell_columns, acting, work.position))
+    return lambda: np.asarray(measure_cells(cell_columns, acting, work.position))
 
 
 def _measure_progpy(work: Work, race: Race, cycles: int = 12) -> Rival:
@@ -177,8 +177,8 @@ def _define_progpy_plant(work: Work) -> Any:
     start["xj"] += work.position[0]
 
     def advance(x: Any, u: Any) -> Any:
-        drawn = x["xj"] + ANCHOR * work.h * (u["measured"] - x["xj"])
-        return step_monitor(np, (x["xs"], drawn, x["v"], x["sliding"]), u["current"], work.h, cell)
+        anchored_xj = x["xj"] + ANCHOR * work.h * (u["measured"] - x["xj"])
+        return step_monitor(np, (x["xs"], anchored_xj, x["v"], x["sliding"]), u["current"], work.h, cell)
 
     return make_progpy_plant(start, ("current", "measured"), ("xj",), advance)
 
@@ -187,17 +187,17 @@ def step_monitor(xp: Any, s: Any, current: Any, h: float, c: Any) -> tuple[Any, 
     """`plant.monitor.step_monitor` on arrays of the library `xp`: XS, XJ, XJ', which way the spool slides."""
     xs, xj, v0, sliding = s
     tilt = c.tilt * current - c.back * xs
-    asked = tilt - clip(xp, tilt, c.slide)
-    asked = xp.where((asked * sliding > 0.0) | (xp.abs(tilt) > c.dead), asked, 0.0)
-    begin = clip(xp, asked, c.most)
-    wait = xp.minimum(xp.abs(asked - begin) * c.wait, h)
+    net_tilt = tilt - clip(xp, tilt, c.slide)
+    net_tilt = xp.where((net_tilt * sliding > 0.0) | (xp.abs(tilt) > c.dead), net_tilt, 0.0)
+    begin = clip(xp, net_tilt, c.most)
+    wait = xp.minimum(xp.abs(net_tilt - begin) * c.wait, h)
     end = begin * xp.exp(c.rate * (wait - h))
-    line, curve, left = c.speed * begin * wait, (begin - end) * c.unback, h - wait
+    line, curve, time_left = c.speed * begin * wait, (begin - end) * c.unback, h - wait
     spool = clip(xp, xs + line + curve, c.spool_travel)
-    area = line * (0.5 * wait + left) + (begin * left - (begin - end) * c.unrate) * c.unback
+    area = line * (0.5 * wait + time_left) + (begin * time_left - (begin - end) * c.unrate) * c.unback
     total = clip(xp, h * xs + area, h * c.spool_travel)
     before = xs - c.lag * c.speed * begin
     free = c.follow * (spool - c.lag * c.speed * end) + (v0 - c.follow * before) * c.fade
     v = xp.minimum(xp.maximum(free, c.coast * v0 - c.push), c.coast * v0 + c.push)
     x = xj + xp.where(v == free, c.follow * total - c.lag * (v - v0), 0.5 * h * (v0 + v))
-    return spool, clip(xp, x, c.jack_travel), xp.where(xp.abs(x) <= c.jack_travel, v, 0.0), xp.sign(asked)
+    return spool, clip(xp, x, c.jack_travel), xp.where(xp.abs(x) <= c.jack_travel, v, 0.0), xp.sign(net_tilt)

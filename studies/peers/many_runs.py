@@ -46,11 +46,11 @@ class Task(NamedTuple):
     @property
     def parameters(self) -> dict[str, dict[str, Array]]:
         """Group to field to the values of the runs, (m,)."""
-        changed = dict(zip(self.names, self.values.T, strict=True))
+        run_values = dict(zip(self.names, self.values.T, strict=True))
         groups: dict[str, dict[str, Array]] = {}
         for name, value in self.model.values.items():
             group, _, field = name.partition(".")
-            groups.setdefault(group, {})[field] = changed.get(name, np.full(len(self.values), value))
+            groups.setdefault(group, {})[field] = run_values.get(name, np.full(len(self.values), value))
         return groups
 
     @property
@@ -88,18 +88,18 @@ def make_jax_replay(task: Task) -> Replay:
     def replay_run(parameters: Any, k: Any, current: Any, load: Any) -> Any:
         p = _make_namespaces(parameters)
 
-        def cycle(s: Any, held: Any) -> Any:
+        def cycle(s: Any, inputs: Any) -> Any:
             def forward(s: Any, _: None) -> tuple[Any, None]:
-                return step_bare_model(numbers, s, held[0], held[1], p, k, h), None
+                return step_bare_model(numbers, s, inputs[0], inputs[1], p, k, h), None
 
             after, _ = jax.lax.scan(forward, s, None, task.steps)
             return after, numbers.stack([s[4], s[6], s[2]])
 
         return jax.lax.scan(cycle, (numbers.zeros(()),) * 7, (current, load))[1]
 
-    compiled = jax.jit(jax.vmap(replay_run, (0, 0, None, None)))
+    replay_runs = jax.jit(jax.vmap(replay_run, (0, 0, None, None)))
     acting, k = np.r_[0.0, task.current[:-1]], _stack_coefficients(task)
-    return lambda: np.asarray(compiled(task.parameters, k, acting, task.load))
+    return lambda: np.asarray(replay_runs(task.parameters, k, acting, task.load))
 
 
 def make_progpy_replay(task: Task) -> Replay:
@@ -171,9 +171,9 @@ def _soften(xp: Any, x: Any, band: Any) -> Any:
 def _slide(xp: Any, v0: Any, impulse: Any, push: Any, line: Any, slope: Any, limit: Any, dry: Any, free: Any,
            coupled: Any) -> Any:
     v = _soften(xp, coupled * impulse + coupled * push * line, coupled * dry)
-    wanted = line - slope * v
-    held = clip(xp, wanted, limit)
-    v = xp.where(held == wanted, v, _soften(xp, impulse + push * held, dry) * free)
+    linear_pressure = line - slope * v
+    pressure = clip(xp, linear_pressure, limit)
+    v = xp.where(pressure == linear_pressure, v, _soften(xp, impulse + push * pressure, dry) * free)
     return xp.minimum(xp.maximum(v, xp.where(v0 > 0.0, 0.0, -xp.inf)), xp.where(v0 < 0.0, 0.0, xp.inf))
 
 
@@ -192,11 +192,11 @@ def compare_many_runs(command: Array, progress: Progress = ignore_progress, roun
     task = _make_task(command, runs, cycles)
     with tempfile.TemporaryDirectory() as folder:
         progress("many runs at once: compiling the rivals", 0.0)
-        replays, skipped = make_replays(_list_makers(task, Path(folder)))
+        replays, skipped_rivals = make_replays(_list_makers(task, Path(folder)))
         progress("many runs at once", 0.0)
         race = race_rivals(replays, OURS, runs * cycles * task.steps, rounds, _compare_positions)
     progress("many runs at once: ProgPy", 0.0)
-    return [*race.rivals, *skipped, _measure_progpy(task, race)]
+    return [*race.rivals, *skipped_rivals, _measure_progpy(task, race)]
 
 
 def _make_task(command: Array, runs: int, cycles: int, first: int = 500) -> Task:

@@ -51,8 +51,8 @@ def race_rivals(replays: Mapping[str, Replay], reference: str, steps: int, round
     """
     results = {name: replay().copy() for name, replay in replays.items()}
     seconds = measure_durations(replays, rounds)
-    rivals = [Rival(name, float(steps / np.median(taken)), float(np.median(taken / seconds[reference])),
-                    difference(results[name], results[reference]), "") for name, taken in seconds.items()]
+    rivals = [Rival(name, float(steps / np.median(durations)), float(np.median(durations / seconds[reference])),
+                    difference(results[name], results[reference]), "") for name, durations in seconds.items()]
     return Race(rivals, results[reference], steps / float(np.median(seconds[reference])))
 
 
@@ -77,14 +77,14 @@ def explain_missing(module: str) -> str:
     return "" if importlib.util.find_spec(module) else f"{module} is not installed; to get it: {GET_EXTRA}"
 
 
-def make_progpy_plant(start: Mapping[str, Array], given: Sequence[str], read: Sequence[str],
+def make_progpy_plant(start: Mapping[str, Array], input_names: Sequence[str], output_names: Sequence[str],
                       advance: Callable[[Any, Any], Sequence[Any]]) -> Any:
     """A model of ProgPy, vectorised over the runs, without noise.
 
     Args:
         start: the states, (m,) each.
-        given: the inputs.
-        read: the states that are outputs.
+        input_names: of the inputs.
+        output_names: of the states that are outputs.
         advance: from states and inputs to the next states.
     """
     from progpy import PrognosticsModel
@@ -93,7 +93,7 @@ def make_progpy_plant(start: Mapping[str, Array], given: Sequence[str], read: Se
         """The plant without its controller."""
 
         is_vectorized = True
-        inputs, states, outputs = list(given), list(start), list(read)
+        inputs, states, outputs = list(input_names), list(start), list(output_names)
         events: list[str] = []  # noqa: RUF012  (the library's own way)
 
         def initialize(self, u: Any = None, z: Any = None) -> Any:
@@ -103,7 +103,7 @@ def make_progpy_plant(start: Mapping[str, Array], given: Sequence[str], read: Se
             return self.StateContainer(dict(zip(start, advance(x, u), strict=True)))
 
         def output(self, x: Any) -> Any:
-            return self.OutputContainer({name: x[name] for name in read})
+            return self.OutputContainer({name: x[name] for name in output_names})
 
     return Plant(process_noise=0, measurement_noise=0)
 

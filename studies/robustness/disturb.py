@@ -234,8 +234,8 @@ def _disturb(action: str, victim: str, rig: subprocess.Popen[bytes], group: str,
         shutil.rmtree(folder, ignore_errors=True)
     if action not in ("kill", "stop"):
         return action == "remove folder"
-    found = [process for process, name in find_processes(group) if name == victim and process != rig.pid]
-    processes = [rig.pid] if victim == "rig" else found[:1]
+    victims = [process for process, name in find_processes(group) if name == victim and process != rig.pid]
+    processes = [rig.pid] if victim == "rig" else victims[:1]
     for process in processes if rig.poll() is None else ():
         with contextlib.suppress(ProcessLookupError):
             os.kill(process, signal.SIGKILL if action == "kill" else signal.SIGSTOP)
@@ -277,25 +277,25 @@ def _read_verdict(file: Path) -> tuple[str, str]:
     return str(answer["verdict"]), str((answer.get("cause") or {}).get("text", ""))
 
 
-def judge_verdict(action: str, victim: str, pause: float, status: int, said: str) -> list[str]:
+def judge_verdict(action: str, victim: str, pause: float, status: int, message: str) -> list[str]:
     """What is wrong with the verdict of a run in lockstep that was disturbed between its cycles.
 
     Args:
         action, victim: what was done to which process.
         pause: s for which it was stopped.
         status: of the rig's process.
-        said: verdict, first cause and error of the run.
+        message: verdict, first cause and error of the run.
     """
     node = {"controller": "node 2 controller", "plant": "node 3 plant"}.get(victim, "the rig")
-    is_named = status == 1 and said.startswith(f"ABORTED {node}")
-    if action == "kill" and not (is_named and "SIGKILL" in said):
-        return [f"the end of the process is not named: status {status}: {said}"]
+    is_named = status == 1 and message.startswith(f"ABORTED {node}")
+    if action == "kill" and not (is_named and "SIGKILL" in message):
+        return [f"the end of the process is not named: status {status}: {message}"]
     if action != "stop":
         return []
     if pause < 1.0 and status != 0:
-        return [f"a stop of {pause:.2f} s ended the run: status {status}: {said}"]
+        return [f"a stop of {pause:.2f} s ended the run: status {status}: {message}"]
     if pause > 3.0 and victim != "rig" and not is_named:
-        return [f"{node} was stopped for {pause:.2f} s, and the run says: status {status}: {said}"]
+        return [f"{node} was stopped for {pause:.2f} s, and the run says: status {status}: {message}"]
     return []
 
 
@@ -347,26 +347,26 @@ def wait_until(done: Callable[[], bool], seconds: float, step: float = 0.02) -> 
 
 def _find_heirs(temporary: Path) -> list[str]:
     """Processes that a run started whose folder for temporary files is `temporary`."""
-    found = []
+    heirs = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             with contextlib.suppress(OSError):
                 if f"TMPDIR={temporary}".encode() in (entry / "environ").read_bytes().split(b"\0"):
-                    found.append((entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")[:60])
-    return found
+                    heirs.append((entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")[:60])
+    return heirs
 
 
 def find_processes(group: str) -> list[tuple[int, str]]:
     """(process, "rig", "plant" or "controller") of the processes of a run on a multicast group."""
-    found = []
+    processes = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             with contextlib.suppress(OSError):
                 words = (entry / "cmdline").read_bytes().split(b"\0")
                 if any(word.endswith(group.encode()) for word in words):
                     name = "plant" if b"plant" in words else "rig" if b"run" in words else "controller"
-                    found.append((int(entry.name), name))
-    return found
+                    processes.append((int(entry.name), name))
+    return processes
 
 
 class Usage(NamedTuple):

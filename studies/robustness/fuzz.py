@@ -84,18 +84,18 @@ def _make_sdo(rng: np.random.Generator) -> bytes:
 
 def _mutate(rng: np.random.Generator, cob_id: int, data: bytes) -> tuple[int, bytes]:
     """The frame with another identifier, another length or other bits."""
-    changed = bytearray(data)
+    mutant = bytearray(data)
     match int(rng.integers(4)):
         case 0:
             cob_id ^= 1 << int(rng.integers(11))
         case 1:
-            changed = changed[:int(rng.integers(9))]
+            mutant = mutant[:int(rng.integers(9))]
         case 2:
-            changed = (changed + rng.bytes(8))[:int(rng.integers(9))]
+            mutant = (mutant + rng.bytes(8))[:int(rng.integers(9))]
         case _:
-            for _ in range(int(rng.integers(1, 5)) if changed else 0):
-                changed[int(rng.integers(len(changed)))] ^= 1 << int(rng.integers(8))
-    return cob_id, bytes(changed)
+            for _ in range(int(rng.integers(1, 5)) if mutant else 0):
+                mutant[int(rng.integers(len(mutant)))] ^= 1 << int(rng.integers(8))
+    return cob_id, bytes(mutant)
 
 
 PAGE = resource.getpagesize()
@@ -127,11 +127,11 @@ def fuzz_node(target: str, frames: int, seed: int, progress: Progress = ignore_p
         progress: called with the target and the share done.
     """
     make: Callable[[Send], Emulator | Firmware] = Emulator if target == "plant" else Firmware
-    bus, heard = EmbeddedBus(), 0
+    bus, answers = EmbeddedBus(), 0
 
     def count(frame: Frame) -> None:
-        nonlocal heard
-        heard += 1
+        nonlocal answers
+        answers += 1
 
     send = bus.attach(count)
     node = bus.add(make)
@@ -156,20 +156,20 @@ def fuzz_node(target: str, frames: int, seed: int, progress: Progress = ignore_p
         if number % 10_000 == 0:
             progress(target, number / frames)
     growth = read_memory() - start
-    return FuzzCount(target, frames, heard, tuple(failures), _is_answering(target, node, bus, last), growth)
+    return FuzzCount(target, frames, answers, tuple(failures), _is_answering(target, node, bus, last), growth)
 
 
 def _is_answering(target: str, node: Node, bus: EmbeddedBus, t_ns: int) -> bool:
     """Whether a node boots, answers SDO, starts and takes part in a cycle as after power-on."""
     number = 3 if target == "plant" else 2
-    heard: list[tuple[int, bytes]] = []
-    send = bus.attach(lambda frame: heard.append((frame.cob_id, frame.data)))
+    frames: list[tuple[int, bytes]] = []
+    send = bus.attach(lambda frame: frames.append((frame.cob_id, frame.data)))
 
     def ask(cob_id: int, data: bytes) -> list[tuple[int, bytes]]:
-        heard.clear()
+        frames.clear()
         send(cob_id, data)
         bus.deliver(t_ns)
-        return list(heard)
+        return list(frames)
 
     boots = (0x700 + number, b"\0") in ask(0x000, bytes((129, number)))
     identity = [data[:4] for cob_id, data in ask(0x600 + number, b"\x40\x00\x10\0\0\0\0\0") if cob_id == 0x580 + number]
@@ -220,29 +220,29 @@ def fuzz_rig(frames: int, seed: int, progress: Progress = ignore_progress, each:
     The rig must end each run with a verdict, and a run without the stranger passes afterwards.
     """
     failures: list[str] = []
-    sent = runs = start = 0
+    total = runs = start = 0
     with tempfile.TemporaryDirectory(prefix="eha-rig-fuzz-") as folder:
-        while sent < frames:
-            stranger: list[_Stranger] = []
-            seconds = min(4.0, max(0.1, (frames - sent) / each / 1000))
+        while total < frames:
+            strangers: list[_Stranger] = []
+            seconds = min(4.0, max(0.1, (frames - total) / each / 1000))
             failure = _play(_make_job(f"{seconds:.3f}", "safe_state"), Path(folder) / "run",
-                            [partial(_join, stranger, frames, each, seed + runs)])
+                            [partial(_join, strangers, frames, each, seed + runs)])
             if failure and len(failures) < 10:
                 failures.append(failure)
-            if not stranger or not stranger[0].sent:
+            if not strangers or not strangers[0].sent:
                 failures.append("the run ended before a frame was sent")
                 break
-            sent, runs = sent + stranger[0].sent, runs + 1
+            total, runs = total + strangers[0].sent, runs + 1
             start = start or read_memory()
-            progress("rig", sent / frames)
+            progress("rig", total / frames)
         growth = read_memory() - start
         works = not _play(_make_job("0.5", "completed"), Path(folder) / "run")
-    return FuzzCount("rig", sent, runs, tuple(failures), works, growth)
+    return FuzzCount("rig", total, runs, tuple(failures), works, growth)
 
 
-def _join(found: list[_Stranger], frames: int, each: int, seed: int, send: Send) -> Node:
-    found.append(_Stranger(send, frames, each, seed))
-    return found[0]
+def _join(strangers: list[_Stranger], frames: int, each: int, seed: int, send: Send) -> Node:
+    strangers.append(_Stranger(send, frames, each, seed))
+    return strangers[0]
 
 
 def _make_job(time: str, ends: str) -> Job:
@@ -263,7 +263,7 @@ def _play(job: Job, folder: Path, strangers: Sequence[Callable[[Send], Node]] = 
             session.bring_up()
             session.run_phases()
             checks, _ = judge_run(job, session, attribute_run(job, session).judged)
-            failed = [check.name for check in checks if not check.passed]
+            failures = [check.name for check in checks if not check.passed]
     except BusError:
         return "" if strangers else "the nodes did not start"  # a stranger may send the very frame that forbids it
     except Exception as error:
@@ -271,4 +271,4 @@ def _play(job: Job, folder: Path, strangers: Sequence[Callable[[Send], Node]] = 
         return f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
     if strangers:
         return ""
-    return session.safety.aborted or "; ".join(failed)
+    return session.safety.aborted or "; ".join(failures)

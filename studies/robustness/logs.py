@@ -42,22 +42,22 @@ def fuzz_logs(source: Path, folder: Path, count: int, seed: int, progress: Progr
     """
     rng = np.random.default_rng(seed)
     original = source.read_bytes()
-    changed, recovered = folder / "changed.mcap", folder / "recovered.mcap"
+    changed_log, recovered_log = folder / "changed.mcap", folder / "recovered.mcap"
     uses: Mapping[str, Callable[[], object]] = {
-        "read": lambda: Trace.read(changed), "report": lambda: _report(changed), "repeat": lambda: read_job(changed),
-        "recover": lambda: recover_log(changed, recovered)}
-    accepted, refused, failures = dict.fromkeys(uses, 0), dict.fromkeys(uses, 0), []
+        "read": lambda: Trace.read(changed_log), "report": lambda: _report(changed_log),
+        "repeat": lambda: read_job(changed_log), "recover": lambda: recover_log(changed_log, recovered_log)}
+    acceptances, refusals, failures = dict.fromkeys(uses, 0), dict.fromkeys(uses, 0), []
     for number in range(count):
         if number % 2:
-            changed.write_bytes(_change_bytes(rng, original))
+            changed_log.write_bytes(_change_bytes(rng, original))
         else:
-            _change_contents(rng, source, changed)
+            _change_contents(rng, source, changed_log)
         for name, use in uses.items():
             try:
                 use()
-                accepted[name] += 1
+                acceptances[name] += 1
             except RigError as error:
-                refused[name] += 1
+                refusals[name] += 1
                 if "\n" in str(error):
                     failures.append(f"{name}, log {number}: a message of several lines")
             except Exception as error:
@@ -65,7 +65,7 @@ def fuzz_logs(source: Path, folder: Path, count: int, seed: int, progress: Progr
                 failures.append(f"{name}, log {number}: {type(error).__name__}: {error} "
                                 f"({Path(where.filename).name}:{where.lineno})")
         progress("logs", number / count)
-    return LogCount(count, accepted, refused, tuple(failures[:10]))
+    return LogCount(count, acceptances, refusals, tuple(failures[:10]))
 
 
 def _report(log: Path) -> None:
@@ -77,20 +77,20 @@ def _report(log: Path) -> None:
 
 def _change_bytes(rng: np.random.Generator, data: bytes) -> bytes:
     """The file with a few bytes changed: anywhere, in its head, or in its summary at the end."""
-    changed = bytearray(data)
+    mutant = bytearray(data)
     for _ in range(int(rng.choice((1, 1, 2, 5, 20)))):
-        low, high = ((0, len(changed)), (0, 30_000), (len(changed) - 4_000, len(changed)))[int(rng.integers(3))]
-        at = int(rng.integers(max(0, low), min(high, len(changed))))
+        low, high = ((0, len(mutant)), (0, 30_000), (len(mutant) - 4_000, len(mutant)))[int(rng.integers(3))]
+        at = int(rng.integers(max(0, low), min(high, len(mutant))))
         match int(rng.integers(4)):
             case 0:
-                changed[at] = int(rng.integers(256))
+                mutant[at] = int(rng.integers(256))
             case 1:
-                changed[at:at + 8] = struct.pack("<Q", _SIZES[int(rng.integers(len(_SIZES)))])
+                mutant[at:at + 8] = struct.pack("<Q", _SIZES[int(rng.integers(len(_SIZES)))])
             case 2:
-                del changed[at:at + int(rng.integers(1, 50))]
+                del mutant[at:at + int(rng.integers(1, 50))]
             case _:
-                changed[at:at] = rng.bytes(int(rng.integers(1, 20)))
-    return bytes(changed)
+                mutant[at:at] = rng.bytes(int(rng.integers(1, 20)))
+    return bytes(mutant)
 
 
 def _change_contents(rng: np.random.Generator, source: Path, out: Path) -> None:
@@ -107,10 +107,10 @@ def _change_contents(rng: np.random.Generator, source: Path, out: Path) -> None:
         spoilt = is_attachment and rng.random() < 0.3
         file.write_attachment(name, "text/plain", _change_some(rng, data) if spoilt else data)
     for name, values in log.metadata.items():
-        said = dict(values)
+        entries = dict(values)
         if rng.random() < 0.3:
-            said[str(rng.choice(list(said)))] = _TEXTS[int(rng.integers(len(_TEXTS)))]
-        file.write_metadata(name, said)
+            entries[str(rng.choice(list(entries)))] = _TEXTS[int(rng.integers(len(_TEXTS)))]
+        file.write_metadata(name, entries)
     raw = bytearray()
     index: dict[int, array[int]] = {}
     for channel, time_ns, data in log.list_raw_messages():
@@ -131,16 +131,16 @@ def _change_contents(rng: np.random.Generator, source: Path, out: Path) -> None:
 
 def _change_some(rng: np.random.Generator, data: bytes) -> bytes:
     """The bytes with one to three places changed."""
-    changed = bytearray(data)
-    for _ in range(int(rng.integers(1, 4)) if changed else 0):
-        at = int(rng.integers(len(changed) + 1))
+    mutant = bytearray(data)
+    for _ in range(int(rng.integers(1, 4)) if mutant else 0):
+        at = int(rng.integers(len(mutant) + 1))
         match int(rng.integers(4)):
             case 0:
-                changed[at:at + 1] = rng.bytes(1)
+                mutant[at:at + 1] = rng.bytes(1)
             case 1:
-                del changed[at:at + int(rng.integers(1, 9))]
+                del mutant[at:at + int(rng.integers(1, 9))]
             case 2:
-                changed[at:at] = rng.bytes(int(rng.integers(1, 12)))
+                mutant[at:at] = rng.bytes(int(rng.integers(1, 12)))
             case _:
-                changed[at:at + 8] = struct.pack("<d", float(rng.choice((np.nan, np.inf, -1e308, 1e300, 0.0))))
-    return bytes(changed)
+                mutant[at:at + 8] = struct.pack("<d", float(rng.choice((np.nan, np.inf, -1e308, 1e300, 0.0))))
+    return bytes(mutant)

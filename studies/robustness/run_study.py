@@ -83,10 +83,10 @@ def _change(rng: np.random.Generator, datagram: bytes) -> bytes:
     if kind < 1.0 / 3.0:
         return datagram
     if kind < 2.0 / 3.0:
-        changed = bytearray(datagram)
+        mutant = bytearray(datagram)
         for _ in range(int(rng.integers(1, 6))):
-            changed[int(rng.integers(len(changed)))] = int(rng.integers(256))
-        return bytes(changed[:int(rng.integers(len(changed) + 1))] if rng.random() < 0.3 else changed)
+            mutant[int(rng.integers(len(mutant)))] = int(rng.integers(256))
+        return bytes(mutant[:int(rng.integers(len(mutant) + 1))] if rng.random() < 0.3 else mutant)
     if kind < 0.68:
         return (_NESTED, _HUGE)[int(rng.integers(2))] + rng.bytes(int(rng.integers(60_000)))
     return rng.bytes(int(rng.integers(100)))
@@ -248,8 +248,8 @@ def _summarise_trials(trials: list[Trial]) -> dict[str, Any]:
 
 
 def _describe_soak(soak: dict[str, Any]) -> dict[str, Any]:
-    usage = {when: {name: held._asdict() for name, held in soak[when].items()} for when in ("start", "end")}
-    return {**soak, **usage}
+    usages = {when: {name: usage._asdict() for name, usage in soak[when].items()} for when in ("start", "end")}
+    return {**soak, **usages}
 
 
 def build_robustness_report(figures: Mapping[str, Any]) -> Report:
