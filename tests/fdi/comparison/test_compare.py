@@ -56,22 +56,24 @@ FAULTS: dict[str, Fault] = {
 }
 
 
-def at_floor(found: Comparison) -> bool:
-    return found.verdict == "WITHIN_FLOOR" and not found.named and found.scatter is None
+def at_floor(comparison: Comparison) -> bool:
+    return comparison.verdict == "WITHIN_FLOOR" and not comparison.named and comparison.scatter is None
 
 
 @pytest.mark.parametrize("colour", ["white", "hum"])
 def test_a_perfect_model_is_at_the_floor(colour: str) -> None:
     """With a repeat and, where the noise is as the model says, without; also if nobody measured the spool."""
-    found = compare(record_healthy(2, colour), MODEL, [record_healthy(3, colour)])
-    assert at_floor(found), describe_verdict(found)
+    comparison = compare(record_healthy(2, colour), MODEL, [record_healthy(3, colour)])
+    assert at_floor(comparison), describe_verdict(comparison)
     for name, limit in {"xj": 0.05, "p12": 0.02, "xs": 0.02}.items():
-        signal = found.signals[name]
+        signal = comparison.signals[name]
         assert (signal.ratio, signal.floor.source) == (pytest.approx(1.0, abs=limit), "repeats")
         assert signal.solver_error < 0.1 * signal.floor.value
-    assert all(ratio is not None and ratio < 1.1 for ratio in found.blocks.values())
-    assert abs(found.drift) < 1e-6 and found.signals["xj"].closed_loop_error > 2 * found.signals["xj"].error
-    assert all(at_floor(compare(record_healthy(3, colour), MODEL, signals=kept)) for kept in (None, ("xj", "p12")))
+    assert all(ratio is not None and ratio < 1.1 for ratio in comparison.blocks.values())
+    assert abs(comparison.drift) < 1e-6 and (
+        comparison.signals["xj"].closed_loop_error > 2 * comparison.signals["xj"].error)
+    assert all(at_floor(compare(record_healthy(3, colour), MODEL, signals=signals))
+               for signals in (None, ("xj", "p12")))
 
 
 OTHER_UNITS: dict[str, dict[str, float]] = {
@@ -82,54 +84,55 @@ OTHER_UNITS: dict[str, dict[str, float]] = {
 
 @pytest.mark.parametrize("kind", OTHER_UNITS)
 def test_a_repeat_from_another_unit_is_no_measure_of_noise(kind: str) -> None:
-    found, true = (compare(record_plant(com=SHORT, seed=2), MODEL, [record_plant(unit, com=SHORT, seed=3)])
-                   for unit in (OTHER_UNITS[kind], {}))
-    assert (found.verdict, true.verdict) == ("CANNOT_TELL", "WITHIN_FLOOR"), describe_verdict(found)
-    assert "repeats of the same unit" in found.reason and "by more than" in found.reason
+    comparison, true = (compare(record_plant(com=SHORT, seed=2), MODEL, [record_plant(unit, com=SHORT, seed=3)])
+                        for unit in (OTHER_UNITS[kind], {}))
+    assert (comparison.verdict, true.verdict) == ("CANNOT_TELL", "WITHIN_FLOOR"), describe_verdict(comparison)
+    assert "repeats of the same unit" in comparison.reason and "by more than" in comparison.reason
 
 
 ROWS = np.arange(4000)
 
 
-@pytest.mark.parametrize(("known", "is_left_out"), [
+@pytest.mark.parametrize(("repeat_rows", "is_left_out"), [
     ({"xj": ROWS >= 0}, True), ({"xj": ROWS % 5 == 0}, True), ({"xj": (ROWS < 900) | (ROWS >= 1600)}, False),
     ({"p12": ROWS >= 0}, False)])
-def test_rows_are_left_out_where_a_repeat_is_known_to_be_at_the_floor(known: dict[str, np.ndarray], is_left_out: bool
-                                                                      ) -> None:
+def test_rows_are_left_out_where_a_repeat_is_known_to_be_at_the_floor(
+        repeat_rows: dict[str, np.ndarray], is_left_out: bool) -> None:
     residual = {"xj": np.where((ROWS >= 1000) & (ROWS < 1500), 10.0, 0.5)}  # floors
     assert is_left_out == find_rows_off_alone(residual, [
-        {name: np.where(rows, 0.5, np.nan) for name, rows in known.items()}], {"xj": Floor(1.0, "repeats")}).any()
+        {name: np.where(rows, 0.5, np.nan) for name, rows in repeat_rows.items()}], {"xj": Floor(1.0, "repeats")}).any()
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_block_with_the_fault_is_named(fault: str) -> None:
     block = fault.partition(":")[0]
-    found = compare(faulty(fault), MODEL)
-    assert found.verdict == "MODEL_INCOMPLETE" and found.named == (block,), describe_verdict(found)
+    comparison = compare(faulty(fault), MODEL)
+    assert comparison.verdict == "MODEL_INCOMPLETE" and comparison.named == (block,), describe_verdict(comparison)
     assert all(ratio is not None and (ratio > 1.5 if name == block else ratio < 1.3)
-               for name, ratio in found.blocks.items())
-    assert f"the {block} disagrees" in describe_verdict(found)
+               for name, ratio in comparison.blocks.items())
+    assert f"the {block} disagrees" in describe_verdict(comparison)
 
 
 def test_another_firmware_is_the_controllers_fault_alone() -> None:
-    found = compare(record_plant({"controller.proportional_gain": 4.2}), MODEL)
-    assert found.verdict == "MODEL_INCOMPLETE" and found.named == ("controller",)
-    assert found.scatter is None and "the output of the controller differs" in describe_verdict(found)
-    assert found.answer.gain == pytest.approx(4.2, rel=1e-6)
+    comparison = compare(record_plant({"controller.proportional_gain": 4.2}), MODEL)
+    assert comparison.verdict == "MODEL_INCOMPLETE" and comparison.named == ("controller",)
+    assert comparison.scatter is None and "the output of the controller differs" in describe_verdict(comparison)
+    assert comparison.answer.gain == pytest.approx(4.2, rel=1e-6)
 
 
 def test_a_sensors_gain_and_a_valves_cannot_be_told_apart() -> None:
-    found = compare(record_plant(sensor=lambda x: 1.02 * x), MODEL)
-    assert set(found.named) == {"jack", "sensor"} and "the jack or the sensor disagree" in describe_verdict(found)
-    assert found.parts["gain"] == pytest.approx(0.02, abs=0.002)
+    comparison = compare(record_plant(sensor=lambda x: 1.02 * x), MODEL)
+    assert set(comparison.named) == {"jack", "sensor"} and (
+        "the jack or the sensor disagree" in describe_verdict(comparison))
+    assert comparison.parts["gain"] == pytest.approx(0.02, abs=0.002)
 
 
 def test_scatter_from_unit_to_unit_is_offered_as_a_reason() -> None:
     """1.5 % in a few parameters is no missing physics; an effect is not explained that way."""
     unit = {"valve.flow_gain": 0.3 * 1.02, "torque_motor.gain": 2.27 * 0.99, "jack.damping": 2000.0 * 1.02}
-    found = compare(record_plant(unit), MODEL)
-    assert found.verdict == "MODEL_INCOMPLETE" and found.scatter is not None and found.scatter.enough
-    assert found.scatter.moved["valve.flow_gain"] == pytest.approx(0.02 / 0.015, abs=0.4)
+    comparison = compare(record_plant(unit), MODEL)
+    assert comparison.verdict == "MODEL_INCOMPLETE" and comparison.scatter is not None and comparison.scatter.enough
+    assert comparison.scatter.moved["valve.flow_gain"] == pytest.approx(0.02 / 0.015, abs=0.4)
     other = compare(faulty("servovalve: spool friction"), MODEL)
     assert other.scatter is not None and not other.scatter.enough
 
@@ -141,21 +144,21 @@ def test_another_actuator_is_to_be_identified(unit: dict[str, float], is_other: 
     assert any("rig identify" in line.text for line in lines) == is_other
 
 
-@pytest.mark.parametrize(("kept", "known"), [
+@pytest.mark.parametrize(("signals", "judged_blocks"), [
     (("xj",), {"controller"}), (("xj", "p12"), {"controller", "servovalve", "jack"}),
     (("xs",), {"controller", "servovalve", "jack", "sensor"})])
-def test_fewer_signals_give_fewer_blocks(kept: tuple[str, ...], known: set[str]) -> None:
-    found = compare(faulty("servovalve: clogged filter"), MODEL, signals=kept)
-    assert tuple(found.signals) == kept and found.verdict == "MODEL_INCOMPLETE"
-    assert {name for name, ratio in found.blocks.items() if ratio is not None} == known
-    assert set(found.named) == ({"servovalve"} if kept != ("xj",) else set())
+def test_fewer_signals_give_fewer_blocks(signals: tuple[str, ...], judged_blocks: set[str]) -> None:
+    comparison = compare(faulty("servovalve: clogged filter"), MODEL, signals=signals)
+    assert tuple(comparison.signals) == signals and comparison.verdict == "MODEL_INCOMPLETE"
+    assert {name for name, ratio in comparison.blocks.items() if ratio is not None} == judged_blocks
+    assert set(comparison.named) == ({"servovalve"} if signals != ("xj",) else set())
 
 
 def test_noise_that_nobody_stated_gives_a_lower_bound() -> None:
     silent = MODEL.replace({"sensors.position_noise": 0.0})
-    found = compare(record_healthy(2, "hum"), silent)
-    assert found.signals["xj"].floor.lower_bound and found.signals["xj"].floor.source == "data"
-    assert found.verdict == "CANNOT_TELL" and "only a lower bound" in describe_verdict(found)
+    comparison = compare(record_healthy(2, "hum"), silent)
+    assert comparison.signals["xj"].floor.lower_bound and comparison.signals["xj"].floor.source == "data"
+    assert comparison.verdict == "CANNOT_TELL" and "only a lower bound" in describe_verdict(comparison)
     assert compare(record_healthy(2, "hum"), silent, [record_healthy(3, "hum")]).verdict == "WITHIN_FLOOR"
     assert compare(faulty("servovalve: clogged filter"), silent).verdict == "MODEL_INCOMPLETE"
 
@@ -172,21 +175,21 @@ def test_rows_lost_at_random_are_no_error(names: tuple[str, ...], repeats: list[
     """With every signal, and without the pressure, whose balance no repeat can show then."""
     keep = np.random.default_rng(0).random(13_500) > 0.05
     columns = {name: np.where(keep, record_healthy(2).column(name), np.nan) for name in names}
-    found = compare(Trace.from_columns(columns, 1e-3, {}), MODEL, [record_healthy(seed) for seed in repeats])
-    assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
+    comparison = compare(Trace.from_columns(columns, 1e-3, {}), MODEL, [record_healthy(seed) for seed in repeats])
+    assert comparison.verdict == "WITHIN_FLOOR", describe_verdict(comparison)
 
 
 def test_columns_out_of_step_are_moved() -> None:
     columns = {n: getattr(record_healthy(2), n) for n in ("com", "xj", "cor", "p12", "xs")}
     columns["cor"] = np.roll(columns["cor"], -3)
-    found = compare(Trace.from_columns(columns, 1e-3, {}), MODEL)
-    assert found.verdict == "WITHIN_FLOOR"
-    assert any("Cor stands 3 cycles earlier" in note for note in found.notes)
+    comparison = compare(Trace.from_columns(columns, 1e-3, {}), MODEL)
+    assert comparison.verdict == "WITHIN_FLOOR"
+    assert any("Cor stands 3 cycles earlier" in note for note in comparison.notes)
 
 
 def test_findings_are_told_in_words() -> None:
-    found = compare(faulty("sensor: play"), MODEL, [record_plant(seed=9, sensor=make_backlash(60e-6))])
-    lines = {line.label: line.text for line in describe_findings(found)}
+    comparison = compare(faulty("sensor: play"), MODEL, [record_plant(seed=9, sensor=make_backlash(60e-6))])
+    lines = {line.label: line.text for line in describe_findings(comparison)}
     assert {"floor", "solver", "where", "when", "residual", "scatter"} <= set(lines)
     assert "after a reversal" in lines["when"]
 
@@ -198,9 +201,9 @@ def c() -> Trace:
 
 @pytest.mark.parametrize("digits", [6, 9])
 def test_rounding_in_a_file_is_no_disagreement(c: Trace, digits: int) -> None:
-    rounded = {name: np.array([float(f"{v:.{digits - 1}e}") for v in c.column(name).tolist()])
+    columns = {name: np.array([float(f"{v:.{digits - 1}e}") for v in c.column(name).tolist()])
                for name in ("cor", "xj")}
-    assert compare_controller(c.with_columns(rounded), MODEL).ratio < CONTROLLER_ERROR_RATIO
+    assert compare_controller(c.with_columns(columns), MODEL).ratio < CONTROLLER_ERROR_RATIO
 
 
 def test_rounding_on_the_bus_is_no_disagreement(c: Trace) -> None:
@@ -213,16 +216,16 @@ def test_rounding_on_the_bus_is_no_disagreement(c: Trace) -> None:
 @pytest.mark.parametrize(("com", "xj"), [(3, 0), (-2, 0), (0, 2), (2, 2)])
 def test_columns_that_are_late(c: Trace, com: int, xj: int) -> None:
     """`com` cycles before row k is what Cor_k answers, the file having it earlier than it should."""
-    found = compare_controller(c.with_columns({"com": shift_rows(c.com, -com), "xj": shift_rows(c.xj, -xj)}), MODEL)
-    assert (found.com_lag, found.xj_lag) == (com, xj) and found.ratio <= 1.0
+    block = compare_controller(c.with_columns({"com": shift_rows(c.com, -com), "xj": shift_rows(c.xj, -xj)}), MODEL)
+    assert (block.com_lag, block.xj_lag) == (com, xj) and block.ratio <= 1.0
     assert find_lags(c, LIMIT)[:2] == find_lags(c.with_columns({"cor": c.cor * 0.0 + LIMIT}), LIMIT)[:2] == (0, 0)
 
 
 def test_a_recorder_that_rounds_positions_is_no_error_of_the_controller(c: Trace) -> None:
-    rounded = c.with_columns({"xj": 7.3e-6 * np.round(c.xj / 7.3e-6)})
+    rounded_trace = c.with_columns({"xj": 7.3e-6 * np.round(c.xj / 7.3e-6)})
     other = MODEL.replace({"controller.proportional_gain": 1.1 * MODEL["controller.proportional_gain"]})
-    assert 0.5 < compare_controller(rounded, MODEL).ratio < CONTROLLER_ERROR_RATIO
-    assert compare_controller(rounded, other).ratio > CONTROLLER_ERROR_RATIO
+    assert 0.5 < compare_controller(rounded_trace, MODEL).ratio < CONTROLLER_ERROR_RATIO
+    assert compare_controller(rounded_trace, other).ratio > CONTROLLER_ERROR_RATIO
 
 
 @pytest.fixture(scope="module")
@@ -234,7 +237,7 @@ def squares(seed: int, rows: int, extra: np.ndarray) -> np.ndarray:
     return sample_noise(seed, rows)[:, 0] ** 2 / LEVELS[0] ** 2 + extra
 
 
-@pytest.mark.parametrize(("chosen", "words"), [
+@pytest.mark.parametrize(("find_rows", "words"), [
     (lambda c, m: np.abs(m.v) > 0.05, "ram faster than 50 mm/s"),
     (lambda c, m: m.reversed_for < 0.02, "within 20 ms after a reversal"),
     (lambda c, m: np.abs(m.others["p12"]) > 1e6, r"\|P12\| above 10 bar"),
@@ -242,8 +245,8 @@ def squares(seed: int, rows: int, extra: np.ndarray) -> np.ndarray:
     (lambda c, m: np.abs(c.cor) > 0.99 * LIMIT, "current at its limit"),
     (lambda c, m: m.v > 5e-4, "ram extends"),
 ])
-def test_the_condition_is_named(c: Trace, m: Motion, chosen: object, words: str) -> None:
-    rows = chosen(c, m)  # type: ignore[operator]
+def test_the_condition_is_named(c: Trace, m: Motion, find_rows: object, words: str) -> None:
+    rows = find_rows(c, m)  # type: ignore[operator]
     z2 = squares(1, len(c), np.where(rows, 30.0, 0.0))
     message = find_condition(z2, m, LIMIT)
     assert message.startswith(("100 %", "99 %")) and re.search(words, message), message
@@ -257,20 +260,20 @@ def test_noise_and_what_is_everywhere_have_no_condition(c: Trace, m: Motion) -> 
 
 def test_sections_with_their_shares(c: Trace, m: Motion) -> None:
     z2 = squares(3, len(c), np.where((c.t >= 4.0) & (c.t < 6.0), 50.0, 0.0))
-    found = locate_error(c, z2, m, LIMIT)
-    worst = found[0]
-    assert sum(p.share for p in found) == pytest.approx(1.0, abs=0.01)
+    places = locate_error(c, z2, m, LIMIT)
+    worst = places[0]
+    assert sum(p.share for p in places) == pytest.approx(1.0, abs=0.01)
     assert worst.section == "ramp at 0.5 mm/s" and (worst.t0, worst.t1) == pytest.approx((4.0, 6.0), abs=2e-3)
     assert worst.share > 0.85 and worst.ratio == pytest.approx(7.1, abs=0.3)
-    assert {"motion within 3 mm", "step to 5 mm"} <= {p.section for p in found}
+    assert {"motion within 3 mm", "step to 5 mm"} <= {p.section for p in places}
 
 
 def test_white_noise_stays_within_its_bands(c: Trace, m: Motion) -> None:
-    found = [examine_residuals(c, {"xj": sample_noise(seed, len(c))[:, 0]}, {}, m)["xj"]
-             for seed in range(100, 120)]  # not that of the trace, whose noise is in its own XJ
-    assert sum(d.departs > d.allowed for d in found) <= 4  # 5 %
-    assert sum(any(abs(f.correlation) > f.bound for f in d.follows) for d in found) <= 3  # 1 % of two
-    assert not any(d.depends and d.depends[0].share > 0.02 for d in found)
+    diagnoses = [examine_residuals(c, {"xj": sample_noise(seed, len(c))[:, 0]}, {}, m)["xj"]
+                 for seed in range(100, 120)]  # not that of the trace, whose noise is in its own XJ
+    assert sum(d.departs > d.allowed for d in diagnoses) <= 4  # 5 %
+    assert sum(any(abs(f.correlation) > f.bound for f in d.follows) for d in diagnoses) <= 3  # 1 % of two
+    assert not any(d.depends and d.depends[0].share > 0.02 for d in diagnoses)
 
 
 def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Trace, m: Motion) -> None:
@@ -284,10 +287,10 @@ def test_coloured_noise_is_white_when_a_repeat_shows_its_colour(c: Trace, m: Mot
 @pytest.mark.parametrize("lag", [1, 7, 30])
 def test_what_follows_an_input_is_found_with_its_lag(c: Trace, lag: int) -> None:
     u = np.random.default_rng(0).standard_normal(len(c)).cumsum()
-    left = 0.5 * np.roll(u, lag) + np.random.default_rng(1).standard_normal(len(c))
-    found = correlate_with_input("Cor", u, WHITE, left, 1e-3)
-    assert found.lag == pytest.approx(lag * 1e-3) and found.correlation > 4 * found.bound
-    alone = correlate_with_input("Cor", u, WHITE, left - 0.5 * np.roll(u, lag), 1e-3)
+    residual = 0.5 * np.roll(u, lag) + np.random.default_rng(1).standard_normal(len(c))
+    peak = correlate_with_input("Cor", u, WHITE, residual, 1e-3)
+    assert peak.lag == pytest.approx(lag * 1e-3) and peak.correlation > 4 * peak.bound
+    alone = correlate_with_input("Cor", u, WHITE, residual - 0.5 * np.roll(u, lag), 1e-3)
     assert abs(alone.correlation) < 1.5 * alone.bound
 
 
@@ -297,12 +300,12 @@ def test_what_follows_an_input_is_found_with_its_lag(c: Trace, lag: int) -> None
 def test_dependence_on_speed_and_its_shape(m: Motion, law: object, word: str) -> None:
     rng = np.random.default_rng(0)
     v = rng.uniform(-0.1, 0.1, 13_500)
-    left = law(v) + 0.1 * rng.standard_normal(len(v))  # type: ignore[operator]
-    found = bin_residual("speed", v, left)
-    assert found is not None and found.shape == word and found.share > 0.8
-    inside = np.abs(found.means - law(found.centres)) < 4 * found.half + 0.05  # type: ignore[operator]
+    residual = law(v) + 0.1 * rng.standard_normal(len(v))  # type: ignore[operator]
+    dependence = bin_residual("speed", v, residual)
+    assert dependence is not None and dependence.shape == word and dependence.share > 0.8
+    inside = np.abs(dependence.means - law(dependence.centres)) < 4 * dependence.half + 0.05  # type: ignore[operator]
     assert inside.mean() > 0.8
-    assert bin_residual("speed", np.zeros(100), left[:100]) is None
+    assert bin_residual("speed", np.zeros(100), residual[:100]) is None
     assert name_shape(np.array([-1.0, 0.0, 1.0]), np.array([1.0, -2.0, 1.5]), np.ones(3)) != "proportional to"
 
 
@@ -317,13 +320,13 @@ def test_the_error_of_a_fast_motion_stands_in_its_cell() -> None:
     trace = Trace.from_columns({name: np.concatenate([slow.column(name), fast.column(name)])
                                 for name in ("com", "xj", "cor")}, 1e-3, {})
     residual = np.where(np.arange(8000) < 4000, 1e-6, 7e-6)
-    found = map_deviation(trace, {"xj": residual}, {"xj": 1e-6})
-    assert found is not None
-    rows = found.amplitudes.searchsorted([0.2e-3, 2e-3]) - 1
-    assert np.nanmax(found.ratio["xj"][rows[0], :1]) == pytest.approx(1.0, abs=0.01)
-    column = int(found.speeds.searchsorted(45e-3)) - 1
-    assert found.ratio["xj"][rows[1], column] == pytest.approx(7.0)
-    assert found.ratio["xj"].shape == (len(found.amplitudes) - 1, len(found.speeds) - 1)
+    deviations = map_deviation(trace, {"xj": residual}, {"xj": 1e-6})
+    assert deviations is not None
+    rows = deviations.amplitudes.searchsorted([0.2e-3, 2e-3]) - 1
+    assert np.nanmax(deviations.ratio["xj"][rows[0], :1]) == pytest.approx(1.0, abs=0.01)
+    column = int(deviations.speeds.searchsorted(45e-3)) - 1
+    assert deviations.ratio["xj"][rows[1], column] == pytest.approx(7.0)
+    assert deviations.ratio["xj"].shape == (len(deviations.amplitudes) - 1, len(deviations.speeds) - 1)
 
 
 MEAN = SensorDynamics(moving_mean=20.0)
@@ -346,32 +349,34 @@ def filter_by_loop(x: np.ndarray, sensor: SensorDynamics) -> np.ndarray:
     return np.array([np.mean(lagged[np.clip(range(k - n + 1, k + 1), 0, None)]) for k in range(len(x))])
 
 
-def measure(sensors: Mapping[str, SensorDynamics], is_told: bool) -> Comparison:
+def measure(sensors: Mapping[str, SensorDynamics], is_declared: bool) -> Comparison:
     """The nominal plant behind filters, compared with or without them."""
     trace = run_nominal()
-    shown = {name: filter_by_loop(trace.column(name), sensor) for name, sensor in sensors.items()}
-    return compare(trace.with_columns(shown, sensors=sensors if is_told else {}), Model())
+    columns = {name: filter_by_loop(trace.column(name), sensor) for name, sensor in sensors.items()}
+    return compare(trace.with_columns(columns, sensors=sensors if is_declared else {}), Model())
 
 
 @pytest.mark.parametrize("sensors", [{"p12": SensorDynamics(moving_mean=8.0)}, {"xj": SensorDynamics(lag=5e-3)},
                                      {"p12": SensorDynamics(lag=4e-3), "xs": SensorDynamics(moving_mean=5.0)}],
                          ids=["moving mean", "lag", "both"])
 def test_filters_of_sensors_are_no_error_of_the_model(sensors: Mapping[str, SensorDynamics]) -> None:
-    """Told of the filter, compare leaves noise; not told, a multiple of it."""
-    told, untold = measure(sensors, True), measure(sensors, False)
+    """Where the filter is declared, compare leaves noise; where not, a multiple of it."""
+    comparison, bare = measure(sensors, True), measure(sensors, False)
     for name in sensors:
-        assert 0.25 * untold.signals[name].error > told.signals[name].error < 1.6 * told.signals[name].floor.value
-    assert any("passes the sensor" in note for note in told.notes)
-    assert (told.blocks["jack"], told.blocks["sensor"]) == (None, None)
+        error, floor = comparison.signals[name].error, comparison.signals[name].floor.value
+        assert 0.25 * bare.signals[name].error > error < 1.6 * floor
+    assert any("passes the sensor" in note for note in comparison.notes)
+    assert (comparison.blocks["jack"], comparison.blocks["sensor"]) == (None, None)
 
 
 def test_rounding_is_noise() -> None:
     """A step of 1 bar is 0.29 bar of noise, beside the 0.2 bar of the sensor."""
     trace = run_nominal()
-    rounded = trace.with_columns({"p12": 1e5 * np.round(trace.p12 / 1e5)}, sensors={"p12": SensorDynamics(quantum=1e5)})
-    found = compare(rounded, Model()).signals["p12"]
-    assert found.floor.value == pytest.approx(np.hypot(2e4, 1e5 / np.sqrt(12.0)), rel=1e-6)
-    assert 0.8 < found.ratio < 1.2
+    rounded_trace = trace.with_columns({"p12": 1e5 * np.round(trace.p12 / 1e5)},
+                                       sensors={"p12": SensorDynamics(quantum=1e5)})
+    signal = compare(rounded_trace, Model()).signals["p12"]
+    assert signal.floor.value == pytest.approx(np.hypot(2e4, 1e5 / np.sqrt(12.0)), rel=1e-6)
+    assert 0.8 < signal.ratio < 1.2
 
 
 def test_mean_of_the_loggers_samples() -> None:
@@ -440,9 +445,9 @@ def nominal(case: str) -> Comparison:
 @pytest.mark.parametrize("case", TRUE)
 @pytest.mark.parametrize(("name", "repeats"), [("est", ["repeat"]), ("holdout", [])])
 def test_the_truth_is_at_the_floor(case: str, name: str, repeats: list[str]) -> None:
-    found = compare(trace(case, name), Model().replace(TRUE[case]), [trace(case, each) for each in repeats])
-    assert found.verdict == "WITHIN_FLOOR", describe_verdict(found)
-    for signal in found.signals.values():
+    comparison = compare(trace(case, name), Model().replace(TRUE[case]), [trace(case, each) for each in repeats])
+    assert comparison.verdict == "WITHIN_FLOOR", describe_verdict(comparison)
+    for signal in comparison.signals.values():
         noise = signal.floor.value / SENSOR_NOISE[signal.signal.name]
         assert (signal.ratio, noise) == pytest.approx((1.0, 1.0), abs=0.03)
 
@@ -450,9 +455,9 @@ def test_the_truth_is_at_the_floor(case: str, name: str, repeats: list[str]) -> 
 @needs_traces
 @pytest.mark.parametrize("case", BLOCK)
 def test_the_nominal_model_lacks_something_in_the_right_block(case: str) -> None:
-    found = nominal(case)
-    assert found.verdict == "MODEL_INCOMPLETE" and found.named[0] == BLOCK[case], describe_verdict(found)
-    assert found.scatter is not None and not found.scatter.enough and found.answer.ratio < 1.0
+    comparison = nominal(case)
+    assert comparison.verdict == "MODEL_INCOMPLETE" and comparison.named[0] == BLOCK[case], describe_verdict(comparison)
+    assert comparison.scatter is not None and not comparison.scatter.enough and comparison.answer.ratio < 1.0
 
 
 @needs_traces
@@ -467,12 +472,12 @@ def test_the_floor_is_the_sensors_noise_however_wrong_the_model(case: str) -> No
 @pytest.mark.skipif(not RIG.exists(), reason="no ../shared/data: no measurements of another actuator")
 def test_measurements_of_another_plant() -> None:
     """No balances and no known firmware there: the plant is one block."""
-    found = compare(Trace.read(RIG / "exp_data_1_1.csv.gz"), load_model("ehs"))
-    worst = max(signal.ratio for signal in found.signals.values())
-    assert found.verdict == "MODEL_INCOMPLETE" and found.named == ("plant",)
-    assert found.blocks == {"controller": None, "plant": worst, "sensors": None}
-    assert found.signals["xj"].floor.value == pytest.approx(2.5e-5 / 12**0.5, rel=0.05)  # rounding to a count
-    assert "the model does not explain" in describe_verdict(found).lower() and len(found.where) > 3
+    comparison = compare(Trace.read(RIG / "exp_data_1_1.csv.gz"), load_model("ehs"))
+    worst = max(signal.ratio for signal in comparison.signals.values())
+    assert comparison.verdict == "MODEL_INCOMPLETE" and comparison.named == ("plant",)
+    assert comparison.blocks == {"controller": None, "plant": worst, "sensors": None}
+    assert comparison.signals["xj"].floor.value == pytest.approx(2.5e-5 / 12**0.5, rel=0.05)  # rounding to a count
+    assert "the model does not explain" in describe_verdict(comparison).lower() and len(comparison.where) > 3
 
 
 DATA = SHARED / "data" / "electrohydrostatic_rig_raw"
@@ -488,8 +493,8 @@ def read_run(run: str) -> Trace:
 
 def measure_errors(model: str, run: str) -> dict[str, float]:
     """RMS residual of XJ and P12, SI."""
-    found = compute_residuals(read_run(run), replay_current(read_run(run), load_model(model), REPLAY_STEPS))
-    return {name: rms(values) for name, values in found.items()}
+    residuals = compute_residuals(read_run(run), replay_current(read_run(run), load_model(model), REPLAY_STEPS))
+    return {name: rms(values) for name, values in residuals.items()}
 
 
 @needs_traces
@@ -506,10 +511,10 @@ def test_the_error_beside_that_of_the_bare_integrator(run: str, position: float,
 @real
 def test_compare_finds_the_shipped_model_by_its_name() -> None:
     """Its error does not depend on the steps of a cycle; that from the command alone falls as well."""
-    found = rig("compare", DATA / "exp_data_1_1.csv.gz", "--model", "servo", "--json").json["signals"]
-    assert found["xj"]["error"] == pytest.approx(measure_errors("servo", "1_1")["xj"], rel=0.03)
+    signals = rig("compare", DATA / "exp_data_1_1.csv.gz", "--model", "servo", "--json").json["signals"]
+    assert signals["xj"]["error"] == pytest.approx(measure_errors("servo", "1_1")["xj"], rel=0.03)
     bare = replay_command(read_run("1_1"), load_model("ehs"), REPLAY_STEPS)
-    assert found["xj"]["closed_loop_error"] < 0.8 * rms(bare["xj"])
+    assert signals["xj"]["closed_loop_error"] < 0.8 * rms(bare["xj"])
 
 
 EMPS = SHARED / "data" / "emps" / "DATA_EMPS.mat"
@@ -531,5 +536,5 @@ def test_dry_friction_brings_the_error_of_the_force_to_the_published_one(
     recording: Path, friction: float, low: float, high: float
 ) -> None:
     """Published with dry friction: 4.08 %, 4.04 % where it was computed again. The model without it is not fitted."""
-    found = answer("compare", recording, "--model", "emps", "--set", f"surface.friction={friction}", status=1)
-    assert low < found["drive_error"] < high
+    comparison = answer("compare", recording, "--model", "emps", "--set", f"surface.friction={friction}", status=1)
+    assert low < comparison["drive_error"] < high
