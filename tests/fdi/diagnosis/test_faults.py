@@ -153,14 +153,14 @@ def pair(x: float, total: float, each: float) -> Any:
     return SimpleNamespace(faults=(first, second), fit=fit)
 
 
-@pytest.mark.parametrize(("x", "total", "grouped"), [(0.0, 0.02, False), (0.2, 0.02, True), (0.35, 0.02, True),
-                                                     (0.35, 0.5, False)])
-def test_faults_that_only_show_as_a_sum_are_a_group(x: float, total: float, grouped: bool) -> None:
+@pytest.mark.parametrize(("x", "total", "is_group"), [(0.0, 0.02, False), (0.2, 0.02, True), (0.35, 0.02, True),
+                                                      (0.35, 0.5, False)])
+def test_faults_that_only_show_as_a_sum_are_a_group(x: float, total: float, is_group: bool) -> None:
     """Each may be absent, but not both: then the sum would be 0."""
-    found = pair(x, total, 5.0)
+    refinement = pair(x, total, 5.0)
     wide = {name: Estimate(x, 0.0, 1.0) for name in "ab"}
-    cut = cut_intervals(found, ["a", "b"], wide)
-    assert find_groups(found, dict.fromkeys("ab")) == (("a", "b"),) * grouped
+    cut = cut_intervals(refinement, ["a", "b"], wide)
+    assert find_groups(refinement, dict.fromkeys("ab")) == (("a", "b"),) * is_group
     if x == 0.0:  # neither can be less than nothing, so neither can be much
         assert all(size.high < 0.08 for size in cut.values())
     if x == 0.35:
@@ -168,18 +168,18 @@ def test_faults_that_only_show_as_a_sum_are_a_group(x: float, total: float, grou
 
 
 def test_a_healthy_unit_within_its_tolerances_is_in_no_group() -> None:
-    found = pair(0.215, 0.01, 5.0)
-    found.faults = tuple(replace(fault, healthy=0.2) for fault in found.faults)
+    refinement = pair(0.215, 0.01, 5.0)
+    refinement.faults = tuple(replace(fault, healthy=0.2) for fault in refinement.faults)
     levels = dict.fromkeys("ab")
-    assert find_groups(found, levels) and find_groups(found, levels, {"one.size": 0.001})
-    assert not find_groups(found, levels, {"one.size": 0.015, "two.size": 0.015})
+    assert find_groups(refinement, levels) and find_groups(refinement, levels, {"one.size": 0.001})
+    assert not find_groups(refinement, levels, {"one.size": 0.015, "two.size": 0.015})
 
 
 def test_a_range_that_begins_at_the_nominal_size_holds_every_healthy_unit() -> None:
     """Else the fit of a unit at the low end of its tolerance leaves more than noise, and no fault explains it."""
     kind = find_plant("ema")
-    declared, placed = kind.faults[0], choose_faults(None, kind)[0]
-    assert declared.range[0] == placed.healthy > placed.range[0] and declared.range[1] == placed.range[1]
+    fault, placed_fault = kind.faults[0], choose_faults(None, kind)[0]
+    assert fault.range[0] == placed_fault.healthy > placed_fault.range[0] and fault.range[1] == placed_fault.range[1]
 
 
 def test_a_fault_may_be_an_effect_without_starts() -> None:
@@ -192,10 +192,10 @@ def test_a_fault_may_be_an_effect_without_starts() -> None:
 def test_backlash_is_measured_although_rows_hang_on_its_impacts() -> None:
     model = load_model("ema")
     faults = [fault for fault in choose_faults(None, model.kind) if fault.name == "backlash"]
-    drawn = build_matrix({"case": [{"backlash": 8e-5}], "seeds": 1}, model, "", "test", faults)
-    found = diagnose(simulate_case(drawn.cases[0], drawn.spec, model), model, faults=faults)
-    assert found.verdict == "MAINTENANCE" and found.ruling == "backlash"
-    assert found.sizes["backlash"].low < 8e-5 < found.sizes["backlash"].high
+    matrix = build_matrix({"case": [{"backlash": 8e-5}], "seeds": 1}, model, "", "test", faults)
+    diagnosis = diagnose(simulate_case(matrix.cases[0], matrix.spec, model), model, faults=faults)
+    assert diagnosis.verdict == "MAINTENANCE" and diagnosis.ruling == "backlash"
+    assert diagnosis.sizes["backlash"].low < 8e-5 < diagnosis.sizes["backlash"].high
 
 
 def test_a_plant_and_faults_of_ones_own(here: Path) -> None:
@@ -223,24 +223,24 @@ range = [0.02, 0.05]
 acceptable = 0.045
 maintenance = 0.04
 """)
-    own = ["--model", "new_plant.py", "--trust", "--faults", "faults.toml"]
+    options = ["--model", "new_plant.py", "--trust", "--faults", "faults.toml"]
     Path("unit").mkdir()
     run = "unit/2026-03-01.csv"
-    rig("simulate", *own[:3], "--set", "dry_friction.torque=1.2", "--seed", "3", "--out", run)
-    made = rig("fdi", "--learn-bands", *own, "--out", "bands.toml", "--json").json
-    assert made["judges"] == ["bearing"]
-    found = rig("fdi", run, *own, "--bands", "bands.toml", "--out", "page.html", "--json").json
-    assert (found["ruling"], found["bands"]["ruling"]) == ("bearing", "bearing")
-    assert found["events"] and {event["section"] for event in found["events"]} == {"step to 0.5 rad"}
-    assert [set(grid["faults"]) for grid in found["grids"]] and "bearing" in found["grids"][0]["faults"]
+    rig("simulate", *options[:3], "--set", "dry_friction.torque=1.2", "--seed", "3", "--out", run)
+    bands = rig("fdi", "--learn-bands", *options, "--out", "bands.toml", "--json").json
+    assert bands["judges"] == ["bearing"]
+    diagnosis = rig("fdi", run, *options, "--bands", "bands.toml", "--out", "page.html", "--json").json
+    assert (diagnosis["ruling"], diagnosis["bands"]["ruling"]) == ("bearing", "bearing")
+    assert diagnosis["events"] and {event["section"] for event in diagnosis["events"]} == {"step to 0.5 rad"}
+    assert [set(grid["faults"]) for grid in diagnosis["grids"]] and "bearing" in diagnosis["grids"][0]["faults"]
     text = re.sub("<[^>]*>", " ", Path("page.html").read_text())
     assert not re.search(r"\b(ram|jack|spool|valve|servo|XJ|XS|Kintas|FSS)\b", text)
-    assert "--bands: of bearing" in refuse("fdi", run, *own[:3], "--bands", "bands.toml")
-    trend = rig("trend", "unit", *own, "--json").json
+    assert "--bands: of bearing" in refuse("fdi", run, *options[:3], "--bands", "bands.toml")
+    trend = rig("trend", "unit", *options, "--json").json
     assert [fault["name"] for fault in trend["faults"]] == ["bearing", "winding", "magnet"]
     cases = ["--fault", "bearing=1", "--seeds", "1", "--jobs", "1", "--out", "campaign"]
-    counted = rig("campaign", *own, *cases, "--json").json
-    assert counted["status"] == {"ok": 1} and counted["faults"] == trend["faults"]
+    campaign = rig("campaign", *options, *cases, "--json").json
+    assert campaign["status"] == {"ok": 1} and campaign["faults"] == trend["faults"]
 
 
 CLOGGED, RUBBED = "filter_clogging", "spool_friction"
@@ -267,8 +267,8 @@ def judged(x: np.ndarray, bands: Bands | None = None) -> BandVerdict:
     return judge_position(PREFLIGHT, x, 1e-3, bands or load_default_bands(), parts=PARTS)
 
 
-def levels(found: list[BandVerdict], fault: str) -> list[Level]:
-    return [j.levels[fault] for j in found]
+def levels(verdicts: list[BandVerdict], fault: str) -> list[Level]:
+    return [j.levels[fault] for j in verdicts]
 
 
 def test_healthy_units_stay_within() -> None:
@@ -278,14 +278,14 @@ def test_healthy_units_stay_within() -> None:
         assert (j.events, j.ruling, j.levels, j.notes) == ((), None, acceptable, ())
 
 
-@pytest.mark.parametrize(("size", "expected", "other"), [((0.35, NAN), CLOGGED, RUBBED),
-                                                         ((NAN, 40.0), RUBBED, CLOGGED)])
-def test_a_fault_is_named(size: tuple[float, float], expected: str, other: str) -> None:
+@pytest.mark.parametrize(("size", "fault", "other"), [((0.35, NAN), CLOGGED, RUBBED),
+                                                      ((NAN, 40.0), RUBBED, CLOGGED)])
+def test_a_fault_is_named(size: tuple[float, float], fault: str, other: str) -> None:
     """A single fault past MidBand rules, and the other is left in peace."""
-    found = [judged(x) for x in units(*size)]
-    assert {j.ruling for j in found} == {expected} and min(levels(found, expected)) >= Level.MAINTENANCE
-    assert set(levels(found, other)) == {Level.ACCEPTABLE}
-    assert all(e.t_out - e.t_in >= 0.9 * BAND_EVENT_SAMPLES * 1e-3 and e.excess > 0 for j in found for e in j.events)
+    verdicts = [judged(x) for x in units(*size)]
+    assert {j.ruling for j in verdicts} == {fault} and min(levels(verdicts, fault)) >= Level.MAINTENANCE
+    assert set(levels(verdicts, other)) == {Level.ACCEPTABLE}
+    assert all(e.t_out - e.t_in >= 0.9 * BAND_EVENT_SAMPLES * 1e-3 and e.excess > 0 for j in verdicts for e in j.events)
 
 
 @pytest.mark.parametrize(("size", "fault", "share", "least", "most"), [
@@ -299,8 +299,8 @@ def test_limits_stand_where_table_2_says(size: tuple[float, float], fault: str, 
 
     Friction delays a step as clogging does; the ramps tell how much of that is friction's.
     """
-    found = levels([judged(x) for x in units(*size, count=48 if least else 16)], fault)
-    assert np.mean([(least or have) <= have <= (most or have) for have in found]) >= share
+    unit_levels = levels([judged(x) for x in units(*size, count=48 if least else 16)], fault)
+    assert np.mean([(least or level) <= level <= (most or level) for level in unit_levels]) >= share
 
 
 def test_spikes_do_not_count() -> None:
@@ -331,9 +331,10 @@ def test_missing_samples() -> None:
     """A section that lost too much is left out and said; a fault without any section has no level."""
     x = units(friction=50.0)[0].copy()
     x[500:4001] = np.nan
-    lost = judged(x)
-    assert lost.levels == {RUBBED: Level.MAINTENANCE}
-    assert sum("is missing" in note for note in lost.notes) == 4 and "filter_clogging is not judged" in lost.notes[-1]
+    verdict = judged(x)
+    assert verdict.levels == {RUBBED: Level.MAINTENANCE}
+    assert sum("is missing" in note for note in verdict.notes) == 4 and (
+        "filter_clogging is not judged" in verdict.notes[-1])
     assert "a measured position" in catch_refusal(judged, np.full(len(x), np.nan))
 
 
@@ -360,11 +361,11 @@ def short_bands(force: float = 0.0) -> Bands:
 
 def test_any_command() -> None:
     """Bands by simulation of a command that nobody has seen before judge as those of the preflight do."""
-    made = short_bands()
-    assert all(map(made.shows, made.faults))
+    bands = short_bands()
+    assert all(map(bands.shows, bands.faults))
     for kind, ruling in ((make_kind(0.4), CLOGGED), (make_kind(friction=60.0), RUBBED), (make_kind(), None)):
         x = simulate_units(load_model(), SHORT, np.zeros_like(SHORT), kind, 16, seed=99)
-        assert {judge_position(SHORT, row, 1e-3, made).ruling for row in x} == {ruling}
+        assert {judge_position(SHORT, row, 1e-3, bands).ruling for row in x} == {ruling}
 
 
 def test_a_model_may_have_a_friction_near_midband_but_not_at_it() -> None:
@@ -376,14 +377,14 @@ def test_a_model_may_have_a_friction_near_midband_but_not_at_it() -> None:
 
 def test_faults_of_a_list_of_ones_own() -> None:
     """Where none is a friction, ramps judge the others as well."""
-    made = make_bands_by_simulation(load_model(), SHORT, 0.0 * SHORT, 1e-3, 48, 32, seed=1, faults=[CLOGGING])
-    again = parse_bands(format_bands(made), "")
-    assert {ramp.fault for ramp in again.ramps} == {CLOGGED} and again.shows(again.faults[0])
+    bands = make_bands_by_simulation(load_model(), SHORT, 0.0 * SHORT, 1e-3, 48, 32, seed=1, faults=[CLOGGING])
+    parsed_bands = parse_bands(format_bands(bands), "")
+    assert {ramp.fault for ramp in parsed_bands.ramps} == {CLOGGED} and parsed_bands.shows(parsed_bands.faults[0])
     for size, level in ((0.0, Level.ACCEPTABLE), (1.2 * CLOGGING.maintenance, Level.NON_NOMINAL)):
         x = simulate_units(load_model(), SHORT, np.zeros_like(SHORT), CLOGGING.list_changes(size), 16, seed=99)
-        assert {judge_position(SHORT, row, 1e-3, again).levels[CLOGGED] for row in x} == {level}
+        assert {judge_position(SHORT, row, 1e-3, parsed_bands).levels[CLOGGED] for row in x} == {level}
     noise = make_bands.sample_sensor_noise(np.random.default_rng(1), load_model(), len(SHORT))
-    assert set(measure_precursors(trace(SHORT + noise, SHORT), again.precursors)["break_away"].adds) == {CLOGGED}
+    assert set(measure_precursors(trace(SHORT + noise, SHORT), parsed_bands.precursors)["break_away"].adds) == {CLOGGED}
 
 
 def test_a_known_load_is_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -435,13 +436,13 @@ def test_bands_remember_their_model_through_a_file() -> None:
     """Its faults and its noise do not count; bands of another model are refused."""
     com = RAMP_AND_SINE[:1400]
     model = Model().replace(OTHER)
-    made = parse_bands(format_bands(make_bands_by_simulation(model, com, np.zeros_like(com), 1e-3, 8, 8)), "file")
+    bands = parse_bands(format_bands(make_bands_by_simulation(model, com, np.zeros_like(com), 1e-3, 8, 8)), "file")
     same = {"filter.clogging": 0.2, "spool.static_friction": 20.0, "spool.dynamic_friction": 10.0,
             "sensors.position_noise": 5e-6}
     assert [list_design(x.replace(same), FAULTS) for x in (Model(), model)] == [{}, OTHER]
-    assert describe_other_model(made, model) == describe_other_model(made, model.replace(same)) == ""
+    assert describe_other_model(bands, model) == describe_other_model(bands, model.replace(same)) == ""
     for other in (Model(), model.replace({"jack.mass": 151.0})):
-        assert describe_other_model(made, other) == "the model eha with jack.mass = 150.0"
+        assert describe_other_model(bands, other) == "the model eha with jack.mass = 150.0"
     line = catch_refusal(diagnose, record_plant(com=RAMP_AND_SINE, seed=1), model, load_default_bands())
     assert re.search(r"--bands: made for the model eha with all parameters nominal.*mass = 150", line)
 
@@ -487,8 +488,8 @@ def test_the_command(tmp_path: Path) -> None:
     com = profile((Hold(time=0.1), Step(to=2e-3, time=0.15), Ramp(to=2.5e-3, time=0.9))).command
     rows = "\n".join(f"{k / 1000:.3f},{value:.9g}" for k, value in enumerate(com))
     command = write_file(tmp_path / "c.csv", f"t,com\n{rows}\n")
-    told = answer("fdi", "--learn-bands", "--command", command, "--out", tmp_path / "b.toml")
-    assert told["judges"] == [CLOGGED, RUBBED]
+    bands = answer("fdi", "--learn-bands", "--command", command, "--out", tmp_path / "b.toml")
+    assert bands["judges"] == [CLOGGED, RUBBED]
     assert load_bands(tmp_path / "b.toml").provenance["command"].endswith("c.csv")
     assert "--out" in refuse("fdi", "--learn-bands")
 
@@ -525,17 +526,17 @@ def test_a_step_of_second_order(zeta: float, omega: float) -> None:
     """Overshoot exp(-pi zeta / root), its square back; settling as on a fine grid."""
     com = np.r_[np.zeros(300), np.full(700, 2e-3)]
     x = np.r_[np.zeros(300), second_order(zeta, omega, 700, 2e-3)]
-    found = measure_features(com, x)
+    features = measure_features(com, x)
     root = math.sqrt(1 - zeta**2)
     over = math.exp(-math.pi * zeta / root)
     fine = np.arange(700_000) * 1e-6
     y = 1 - np.exp(-zeta * omega * fine) * (np.cos(omega * root * fine) + zeta / root * np.sin(omega * root * fine))
-    for name, expected in {
+    for name, reference in {
             "overshoot_2mm": pytest.approx(100 * over, abs=0.6),
             "undershoot_2mm": pytest.approx(100 * over**2, abs=0.3),
             "settling_time_2mm": pytest.approx(fine[np.flatnonzero(np.abs(y - 1) > 0.05)[-1]], abs=1.5e-3),
             "rest_error": pytest.approx(0.0, abs=1e-6)}.items():
-        assert found[name] == expected, name
+        assert features[name] == reference, name
 
 
 def test_an_oscillation_on_a_ramp() -> None:
@@ -544,18 +545,18 @@ def test_an_oscillation_on_a_ramp() -> None:
     com = np.r_[np.zeros(300), ramp, np.full(300, 1e-3), 1e-3 - ramp, np.zeros(300)]
     wave = 5e-5 * np.sin(2 * np.pi * 8 * np.arange(len(com)) * MS)
     way = np.repeat([0.0, 1.0, 0.0, -1.0, 0.0], [300, 2000, 300, 2000, 300])
-    found = measure_features(com, com - 7e-6 * way + wave)
-    for name, expected in {
+    features = measure_features(com, com - 7e-6 * way + wave)
+    for name, reference in {
             "stick_slip_frequency": pytest.approx(8.0, abs=0.4), "stick_slip_amplitude": pytest.approx(5e-5, rel=0.02),
             "break_away": pytest.approx(5e-5, rel=0.02), "mean_ramp_error": pytest.approx(7e-6, abs=1.5e-6),
             "speed_ripple": pytest.approx(2 * np.pi * 8 * 5e-5 / math.sqrt(2), rel=0.06)}.items():
-        assert found[name] == expected, name
+        assert features[name] == reference, name
 
 
 def test_what_a_command_does_not_show() -> None:
     """No ramps, no stick-slip; no steps, no overshoot; an oscillation that goes on has no settling time."""
     com = np.r_[np.zeros(200), np.full(800, 1e-3)]
-    found = measure_features(com, com + 2e-4 * np.sin(2 * np.pi * 10 * np.arange(1000) * MS))
-    assert "break_away" not in found and math.isnan(found["settling_time_1mm"])
+    features = measure_features(com, com + 2e-4 * np.sin(2 * np.pi * 10 * np.arange(1000) * MS))
+    assert "break_away" not in features and math.isnan(features["settling_time_1mm"])
     assert format_precursor(math.nan, "settling_time_1mm") == "-"
     assert compute_features(np.zeros(500), np.zeros((1, 500)), MS, [Section("hold", 0, 500, 0.0, 0.0, 0.0)]) == {}

@@ -74,20 +74,20 @@ def test_tolerances_decide_how_wide_an_interval_is(off_grid: Refinement) -> None
     ({"null_bias.current": 1e-4}, "null_bias.current", 1e-4),
     ({"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}, "jack.dynamic_friction", 1000.0)])
 def test_what_is_not_the_valve_is_not_blamed_on_it(settings: dict[str, float], name: str, value: float) -> None:
-    found = refine_sizes(MODEL, hold_inputs(record_plant(settings)))
-    other = found.others[name]
-    assert found.is_explained
-    assert all(judge_size(fault, found.sizes[fault.name]) == Level.ACCEPTABLE for fault in FAULTS)
+    refinement = refine_sizes(MODEL, hold_inputs(record_plant(settings)))
+    other = refinement.others[name]
+    assert refinement.is_explained
+    assert all(judge_size(fault, refinement.sizes[fault.name]) == Level.ACCEPTABLE for fault in FAULTS)
     assert other.value == pytest.approx(value, rel=0.05) and abs(other.high - other.low) < 0.5 * abs(value)
 
 
-@pytest.mark.parametrize(("size", "expected"), [
+@pytest.mark.parametrize(("size", "level"), [
     ((0.05, 0.0, 0.1), Level.ACCEPTABLE), ((0.21, 0.16, 0.26), Level.MAINTENANCE),
     ((0.25, 0.2, 0.3), Level.MAINTENANCE), ((0.31, 0.27, 0.36), Level.NON_NOMINAL),
     ((0.2, 0.155, 0.243), Level.ACCEPTABLE), ((0.2, 0.155, 0.247), Level.MAINTENANCE),  # by the margin
     ((0.31, 0.24, 0.38), Level.MAINTENANCE), ((0.5, 0.4, 0.6), Level.NON_NOMINAL), ((0.2, 0.0, 0.4), None)])
-def test_levels(size: tuple[float, float, float], expected: Level | None) -> None:
-    assert judge_size(CLOGGING, Estimate(*size)) == expected
+def test_levels(size: tuple[float, float, float], level: Level | None) -> None:
+    assert judge_size(CLOGGING, Estimate(*size)) == level
 
 
 @pytest.mark.parametrize(("clogging", "friction", "ruling"), [
@@ -108,38 +108,39 @@ COMMAND = np.concatenate([PREFLIGHT[2000:4200], PREFLIGHT[9000:11600]])  # steps
 
 
 @pytest.fixture(scope="module")
-def worn() -> Diagnosis:
+def lag_diagnosis() -> Diagnosis:
     trace = record_plant({"filter.clogging": 0.35, "sensor_lag.time": 1e-3}, COMMAND, seed=3)
     with restored_catalogue(*SEARCHED):
         return diagnose(trace, with_effects=True)
 
 
-def test_a_fault_is_sized_beside_a_slow_transducer(worn: Diagnosis) -> None:
-    assert (worn.verdict, worn.ruling) == ("NON_NOMINAL", CLOGGING.name)
-    assert worn.sizes[CLOGGING.name].low < 0.35 < worn.sizes[CLOGGING.name].high
-    assert worn.levels == {CLOGGING.name: Level.NON_NOMINAL, FRICTION.name: Level.ACCEPTABLE}
-    assert worn.beside is not None and worn.beside.best.effects == ("sensor_lag",)
-    lag = worn.beside.best.parameters["sensor_lag.time"]
+def test_a_fault_is_sized_beside_a_slow_transducer(lag_diagnosis: Diagnosis) -> None:
+    assert (lag_diagnosis.verdict, lag_diagnosis.ruling) == ("NON_NOMINAL", CLOGGING.name)
+    assert lag_diagnosis.sizes[CLOGGING.name].low < 0.35 < lag_diagnosis.sizes[CLOGGING.name].high
+    assert lag_diagnosis.levels == {CLOGGING.name: Level.NON_NOMINAL, FRICTION.name: Level.ACCEPTABLE}
+    assert lag_diagnosis.beside is not None and lag_diagnosis.beside.best.effects == ("sensor_lag",)
+    lag = lag_diagnosis.beside.best.parameters["sensor_lag.time"]
     assert lag.low < 1e-3 < lag.high < lag.low + 2e-4
 
 
-def test_the_answer_lists_effects_with_sizes_and_probability(worn: Diagnosis) -> None:
-    report = build_diagnosis_report(worn)
+def test_the_answer_lists_effects_with_sizes_and_probability(lag_diagnosis: Diagnosis) -> None:
+    report = build_diagnosis_report(lag_diagnosis)
     data = report.data["with_effects"]
     assert data["effects"][0] == "sensor_lag" and data["explained"] and "sensor_lag" in report.sentence
     assert sum(each["probability"] for each in data["explanations"]) == pytest.approx(1.0)
     assert set(data["explanations"][0]["parameters"]["sensor_lag.time"]) == {"value", "low", "high", "unit"}
     assert next(s for s in report.sections if s.title == "Other effects").items
-    plain = build_diagnosis_report(replace(worn, verdict="SOMETHING_ELSE", beside=None))
+    plain = build_diagnosis_report(replace(lag_diagnosis, verdict="SOMETHING_ELSE", beside=None))
     assert "--with-effects" in plain.sentence and "with_effects" not in plain.data
 
 
-def test_a_searched_fit_that_misses_stops_explains_nothing(worn: Diagnosis) -> None:
+def test_a_searched_fit_that_misses_stops_explains_nothing(lag_diagnosis: Diagnosis) -> None:
     """The typical block alone would accept it: more clogging had made up for a lag, with twice the noise left."""
-    assert worn.beside is not None
-    found = worn.beside.best.refinement
-    missed = replace(found, errors={name: 2.1 * floor for name, floor in found.floor.items()})
-    assert found.is_explained and not missed.is_explained and replace(missed, worst=RESIDUAL_WORST).is_explained
+    assert lag_diagnosis.beside is not None
+    refinement = lag_diagnosis.beside.best.refinement
+    poor_refinement = replace(refinement, errors={name: 2.1 * floor for name, floor in refinement.floor.items()})
+    assert refinement.is_explained and not poor_refinement.is_explained
+    assert replace(poor_refinement, worst=RESIDUAL_WORST).is_explained
 
 
 def test_the_search_leaves_out_what_every_fit_has() -> None:
@@ -155,21 +156,21 @@ def test_a_mixture_holds_what_each_part_allows() -> None:
     assert (alone.low, alone.high) == pytest.approx((0.0, 0.2), abs=2e-3)
 
 
-def average(worn: Diagnosis, second: Estimate, more: float = 0.0) -> Beside:
+def average(lag_diagnosis: Diagnosis, second: Estimate, more: float = 0.0) -> Beside:
     """Over a lag without a fault, and another one whose fit costs so much more, with this size of clogging."""
-    found = worn.refinement
+    refinement = lag_diagnosis.refinement
     return average_explanations([
         Explanation((effect,), {}, replace(
-            found, sizes={**found.sizes, CLOGGING.name: kintas}, fit=replace(found.fit, cost=cost)))
+            refinement, sizes={**refinement.sizes, CLOGGING.name: kintas}, fit=replace(refinement.fit, cost=cost)))
         for effect, kintas, cost in (("sensor_lag", Estimate(0.05, 0.0, 0.1), 100.0),
                                      ("coil_lag", second, 100.0 + more))])
 
 
-def test_a_level_that_depends_on_the_effect_is_disputed(worn: Diagnosis) -> None:
-    found = average(worn, Estimate(0.3, 0.25, 0.34))
-    assert found.disputed == (CLOGGING.name,) and found.is_ambiguous
-    assert average(worn, Estimate(0.07, 0.02, 0.12)).disputed == ()
-    unlikely = average(worn, Estimate(0.3, 0.25, 0.34), 200.0)
+def test_a_level_that_depends_on_the_effect_is_disputed(lag_diagnosis: Diagnosis) -> None:
+    beside = average(lag_diagnosis, Estimate(0.3, 0.25, 0.34))
+    assert beside.disputed == (CLOGGING.name,) and beside.is_ambiguous
+    assert average(lag_diagnosis, Estimate(0.07, 0.02, 0.12)).disputed == ()
+    unlikely = average(lag_diagnosis, Estimate(0.3, 0.25, 0.34), 200.0)
     assert unlikely.disputed == () and not unlikely.is_ambiguous and unlikely.sizes[CLOGGING.name].value == 0.05
 
 
@@ -182,8 +183,8 @@ def trace(kintas: float, fss: float, ratio: float = 2.0 / 3.0, scatter: int = 0)
     """A preflight with faults; `scatter` seeds the tolerances of the plant, 0 for none."""
     rng, model = np.random.default_rng(scatter), Model()
     model = model.replace({name: model[name] * (1 + 0.015 * bool(scatter) * rng.normal()) for name in PLANTS})
-    changed = model.replace(faulty(kintas, fss) | {"spool.dynamic_friction": fss * ratio})
-    return simulate_trace(changed, PREFLIGHT, seed=scatter)
+    unit = model.replace(faulty(kintas, fss) | {"spool.dynamic_friction": fss * ratio})
+    return simulate_trace(unit, PREFLIGHT, seed=scatter)
 
 
 def is_near(point: Any, kintas: float, fss: float, within: tuple[float, float] = (0.051, 4.5)) -> bool:
@@ -197,18 +198,18 @@ def map_of(kintas: float, fss: float) -> Map:
 
 def test_maps_are_rms_of_the_monitor() -> None:
     """One cell by hand."""
-    measured = trace(0.25, 30.0)
-    grid = search_grid(measured, sliding=(1.0,))
+    faulty_trace = trace(0.25, 30.0)
+    grid = search_grid(faulty_trace, sliding=(1.0,))
     row, column = 7, 5
-    c = read_cycles(measured, Model())[0]
+    c = read_cycles(faulty_trace, Model())[0]
     run = Monitor(Model()).replay(np.array([[grid.axes[0][row], grid.axes[1][column]]]), c.cor, c.xj, 20.0)[0, 0]
     steps, ramps = np.r_[500:4001], np.r_[4001:6001, 6501:8501]  # the sections of the preflight
     of_steps, of_ramps = (np.var((c.xj - run)[rows]) for rows in (steps, ramps))
     both = (len(steps) * of_steps + len(ramps) * of_ramps) / (len(steps) + len(ramps))
-    for made, variance in ((grid.step, of_steps), (grid.ramp, of_ramps), (grid.joint, both)):
-        assert made.rms[row, column] == pytest.approx(np.sqrt(variance), rel=1e-9) and made.rms.shape == (21, 21)
-        where = np.argwhere(made.rms == made.rms.min())[0]
-        assert made.minimum == ((grid.axes[0][where[0]], grid.axes[1][where[1]]), made.rms.min())
+    for rms_map, variance in ((grid.step, of_steps), (grid.ramp, of_ramps), (grid.joint, both)):
+        assert rms_map.rms[row, column] == pytest.approx(np.sqrt(variance), rel=1e-9) and rms_map.rms.shape == (21, 21)
+        cell = np.argwhere(rms_map.rms == rms_map.rms.min())[0]
+        assert rms_map.minimum == ((grid.axes[0][cell[0]], grid.axes[1][cell[1]]), rms_map.rms.min())
     assert grid.simulations == 441 + 21 * 13
 
 
@@ -217,17 +218,17 @@ def test_maps_are_rms_of_the_monitor() -> None:
 def test_minimum_is_at_the_faults(kintas: float, fss: float, scatter: int) -> None:
     """Within the width of the valley: Kintas is weak, FSS is not."""
     grid = search_grid(trace(kintas, fss, scatter=scatter), sliding=(2.0 / 3.0,))
-    for found in (grid.joint.minimum, grid.best):
-        assert is_near(found, kintas, fss, (0.176 if scatter else 0.051, 9.0)), found
+    for point in (grid.joint.minimum, grid.best):
+        assert is_near(point, kintas, fss, (0.176 if scatter else 0.051, 9.0)), point
     assert grid.best.rms <= grid.joint.minimum.rms
 
 
 def test_friction_that_is_static_alone() -> None:
     """`--set spool.static_friction=70` leaves FDS as it was; the grid finds FSS, as it tries how the spool slides."""
-    measured = trace(0.0, 70.0, ratio=10.0 / 3.0 / 70.0)
-    found, paper = search_grid(measured), search_grid(measured, sliding=(1.0,))
-    assert found.joint.minimum.sizes[1] == pytest.approx(70.0, abs=9.0)
-    assert found.joint.minimum.rms < 0.9 * paper.joint.minimum.rms
+    faulty_trace = trace(0.0, 70.0, ratio=10.0 / 3.0 / 70.0)
+    grid, paper_grid = search_grid(faulty_trace), search_grid(faulty_trace, sliding=(1.0,))
+    assert grid.joint.minimum.sizes[1] == pytest.approx(70.0, abs=9.0)
+    assert grid.joint.minimum.rms < 0.9 * paper_grid.joint.minimum.rms
 
 
 @pytest.mark.parametrize("which", ["step", "ramp"])
@@ -245,12 +246,12 @@ def test_a_command_with_one_kind_of_section(which: str) -> None:
 @pytest.mark.parametrize(("kintas", "fss", "other"), [
     (0.25, 30.0, "load"), (0.0, 5.0, "null bias"), (0.25, 30.0, "jack friction")])
 def test_what_is_no_fault_of_these_does_not_lead_astray(kintas: float, fss: float, other: str) -> None:
-    changed = {"load": {}, "null bias": {"null_bias.current": 1e-4},
+    changes = {"load": {}, "null bias": {"null_bias.current": 1e-4},
                "jack friction": {"jack.static_friction": 1600.0, "jack.dynamic_friction": 1000.0}}[other]
     load = np.full(len(PREFLIGHT), 3e3 * (other == "load"))
-    measured = simulate_trace(Model().replace(faulty(kintas, fss) | changed), PREFLIGHT, load)
-    found = search_grid(measured, sliding=(2.0 / 3.0,)).best
-    assert is_near(found, kintas, fss, (0.126, 4.5)), found
+    faulty_trace = simulate_trace(Model().replace(faulty(kintas, fss) | changes), PREFLIGHT, load)
+    point = search_grid(faulty_trace, sliding=(2.0 / 3.0,)).best
+    assert is_near(point, kintas, fss, (0.126, 4.5)), point
 
 
 def test_gaps_are_left_out() -> None:
@@ -278,11 +279,11 @@ def test_first_bisector(kintas: float, fss: float, distance: float) -> None:
 
 def test_centre_of_gravity() -> None:
     def merge(step: Map | None, ramp: Map | None) -> tuple[float, ...]:
-        found = merge_minima(step, ramp, FAULTS)
-        return (*found.sizes, found.weight, found.distance)
+        minimum = merge_minima(step, ramp, FAULTS)
+        return (*minimum.sizes, minimum.weight, minimum.distance)
 
-    merged = merge(map_of(0.34, 30.0), map_of(0.26, 40.0))  # their middle is (0.30, 35): 3/4 for the steps
-    assert merged == pytest.approx((0.75 * 0.34 + 0.25 * 0.26, 0.75 * 30.0 + 0.25 * 40.0, 0.75, 0.5))
+    centre = merge(map_of(0.34, 30.0), map_of(0.26, 40.0))  # their middle is (0.30, 35): 3/4 for the steps
+    assert centre == pytest.approx((0.75 * 0.34 + 0.25 * 0.26, 0.75 * 30.0 + 0.25 * 40.0, 0.75, 0.5))
     assert merge(map_of(0.4, 20.0), map_of(0.36, 60.0))[:3] == pytest.approx((0.4, 20.0, 1.0))
     assert merge(map_of(0.1, 20.0), map_of(0.0, 60.0))[:3] == pytest.approx((0.0, 60.0, 0.0))
     assert merge(None, map_of(0.3, 20.0)) == (0.3, 20.0, 0.0, -1.0)
