@@ -105,9 +105,9 @@ def test_coloured_noise_becomes_white(seed: int) -> None:
 def test_what_is_not_measured_counts_as_nothing_and_a_stop_that_came_later_is_no_noise() -> None:
     rows, white = np.arange(13_500), np.random.default_rng(0).normal(0.0, 1.0, 13_500)
     holed = np.where((rows >= 500) & (rows < 520), np.nan, coloured(0))
-    whitened = np.empty((1, 1, 13_500))
-    fit_noise(holed).whiten_signal(holed[None, None], 0, whitened)
-    assert np.isfinite(whitened).all() and (whitened[..., 500:520] == 0.0).all()
+    white_signal = np.empty((1, 1, 13_500))
+    fit_noise(holed).whiten_signal(holed[None, None], 0, white_signal)
+    assert np.isfinite(white_signal).all() and (white_signal[..., 500:520] == 0.0).all()
     late = white + 50.0 * ((rows >= 3000) & (rows < 4000))
     assert (measure_level(late), fit_noise(late).level) == pytest.approx((1.0, 1.0), rel=0.05)
 
@@ -116,8 +116,8 @@ def test_independent_noise_of_any_colour_does_not_repeat_and_physics_does() -> N
     ratios = [measure_repeating(coloured(s)[None], [coloured(s + 500)[None]], [0.0])[0] for s in SEEDS]
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.02) and max(ratios) < 1.08  # the gate
     physics = 1e-6 * np.sin(np.arange(13_500) / 200.0)
-    found = measure_repeating((coloured(1) + physics)[None], [(coloured(2) + physics)[None]], [0.0])[0]
-    assert found == pytest.approx(np.sqrt(1 + 0.5e-12 / 4e-12), abs=0.03)
+    ratio = measure_repeating((coloured(1) + physics)[None], [(coloured(2) + physics)[None]], [0.0])[0]
+    assert ratio == pytest.approx(np.sqrt(1 + 0.5e-12 / 4e-12), abs=0.03)
 
 
 def _recorded(changes: dict[str, float], seed: int = 0) -> Trace:
@@ -128,23 +128,23 @@ def _recorded(changes: dict[str, float], seed: int = 0) -> Trace:
 
 def test_the_firmware_leaves_its_mark_without_noise() -> None:
     model = Model()
-    healthy, limited = hold_inputs(_recorded({})), hold_inputs(_recorded({"command_rate_limit.rate": 0.12}))
-    assert np.nanmax(np.abs(compute_firmware_residual(model, healthy))) == 0.0
-    plain, marks = find_marks(model, [healthy]), find_marks(model, [limited])
+    healthy_trace, limited_trace = hold_inputs(_recorded({})), hold_inputs(_recorded({"command_rate_limit.rate": 0.12}))
+    assert np.nanmax(np.abs(compute_firmware_residual(model, healthy_trace))) == 0.0
+    plain, marks = find_marks(model, [healthy_trace]), find_marks(model, [limited_trace])
     assert (plain.controller, plain.prints, plain.step) == (0.0, (), 0.0)
     assert marks.controller > 100.0 and marks.is_firmware_different
-    (found,) = marks.prints
-    value, low, high = found.parameters["command_rate_limit.rate"]
+    (fingerprint,) = marks.prints
+    value, low, high = fingerprint.parameters["command_rate_limit.rate"]
     assert low <= 0.12 <= high or value == pytest.approx(0.12, rel=1e-6)
     slower = hold_inputs(_recorded({"asymmetric_gain.retraction": -0.2}))
-    (found,) = [each for each in find_marks(model, [slower]).prints if each.effect == "asymmetric_gain"]
-    assert found.parameters["asymmetric_gain.retraction"][0] == pytest.approx(-0.2, rel=1e-4)
+    (fingerprint,) = [each for each in find_marks(model, [slower]).prints if each.effect == "asymmetric_gain"]
+    assert fingerprint.parameters["asymmetric_gain.retraction"][0] == pytest.approx(-0.2, rel=1e-4)
 
 
 def test_a_converter_with_few_bits_leaves_a_comb() -> None:
     marks = find_marks(Model(), [hold_inputs(_recorded({"quantisation.lsb": 7.3e-6}))])
-    (found,) = marks.prints
-    assert found.parameters["quantisation.lsb"][0] == pytest.approx(7.3e-6, rel=1e-4) and not marks.is_recorder
+    (fingerprint,) = marks.prints
+    assert fingerprint.parameters["quantisation.lsb"][0] == pytest.approx(7.3e-6, rel=1e-4) and not marks.is_recorder
 
 
 def test_a_recorder_that_rounds_positions_is_no_effect() -> None:
@@ -156,8 +156,9 @@ def test_a_recorder_that_rounds_positions_is_no_effect() -> None:
     assert healthy.is_recorder and healthy.controller < 2.0 and not healthy.prints
     slow, again = (record_rounded({"sensor_lag.time": 1e-3}, seed) for seed in (1, 2))
     with restored_catalogue(*SEARCHED):
-        found = explain(Model(), slow, [again])
-    assert (found.verdict, found.effects) == ("EXPLAINED", ("sensor_lag",)) and found.marks.is_recorder
+        explanation = explain(Model(), slow, [again])
+    assert (explanation.verdict, explanation.effects) == (
+        "EXPLAINED", ("sensor_lag",)) and explanation.marks.is_recorder
 
 
 def test_a_wave_over_the_position_and_a_curve_over_the_speed_are_found() -> None:
@@ -176,15 +177,16 @@ def test_a_wave_over_the_position_and_a_curve_over_the_speed_are_found() -> None
 @pytest.mark.parametrize("shape", ["wave", "curve"])
 def test_what_is_discovered_becomes_an_effect_that_runs(shape: str, tmp_path: Path) -> None:
     at = np.linspace(-0.1, 0.1, 9)
-    found = Pattern("force", "N", 500.0, "position" if shape == "wave" else "speed", 0.9, at, 1e4 * at, at * 0 + 1.0,
-                    (700.0, 2.5e-3, 0.3) if shape == "wave" else None, np.zeros(10), ("load", "x + {0}"))
-    write_effect(found, tmp_path / "found.py")
+    pattern = Pattern("force", "N", 500.0, "position" if shape == "wave" else "speed", 0.9, at, 1e4 * at, at * 0 + 1.0,
+                      (700.0, 2.5e-3, 0.3) if shape == "wave" else None, np.zeros(10), ("load", "x + {0}"))
+    write_effect(pattern, tmp_path / "found.py")
     assert len((tmp_path / "found.py").read_text().splitlines()) < 40
     assert load_effects(tmp_path / "found.py") == ["discovered"]
     start = CATALOGUE["discovered"].starts[-1]
     com = 3e-3 * np.sin(2 * np.pi * np.arange(300) * 1e-3)
-    moved, still = (simulate(model, com, steps=20, fast=False).p12 for model in (Model().replace(start), Model()))
-    assert np.abs(moved - still).max() > 2e4  # Pa, the sensor's noise
+    pressure, nominal_pressure = (
+        simulate(model, com, steps=20, fast=False).p12 for model in (Model().replace(start), Model()))
+    assert np.abs(pressure - nominal_pressure).max() > 2e4  # Pa, the sensor's noise
 
 
 def test_a_scan_finds_a_frequency_from_a_line_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,8 +197,8 @@ def test_a_scan_finds_a_frequency_from_a_line_beside_it(monkeypatch: pytest.Monk
     beside = [{**ripple, "supply_ripple.frequency": 36.64 - 2.3 * turn, "supply_ripple.phase": phase}
               for phase in (0.0, 1.57, 3.14, 4.71)]
     monkeypatch.setattr("fdi.discovery.search.find_tones", lambda *_: beside)
-    (found,) = scan_effects(search.problem, [search.fit_base().fit], ["supply_ripple"])
-    values = {f.name: f.centre + f.scale * x for f, x in zip(found.free, found.x, strict=True)}
+    (prospect,) = scan_effects(search.problem, [search.fit_base().fit], ["supply_ripple"])
+    values = {f.name: f.centre + f.scale * x for f, x in zip(prospect.free, prospect.x, strict=True)}
     assert values["supply_ripple.frequency"] == pytest.approx(36.64, abs=0.3 * turn)
 
 
@@ -217,9 +219,9 @@ def test_a_recording_without_noise_is_taken_to_have_some() -> None:
 @pytest.fixture(scope="module")
 def search() -> Search:
     """A run with a null bias, whose unknowns are the tolerances and this bias."""
-    found = Search(load_model().replace(BIAS), hold_inputs(record_plant(BIAS, COMMAND)), [], [], 1)
-    found.problem = replace(found.problem, bare=None)
-    return found
+    bias_search = Search(load_model().replace(BIAS), hold_inputs(record_plant(BIAS, COMMAND)), [], [], 1)
+    bias_search.problem = replace(bias_search.problem, bare=None)
+    return bias_search
 
 
 def test_a_held_out_run_may_lack_signals(search: Search) -> None:
@@ -232,13 +234,13 @@ def test_an_effect_counts_only_if_its_interval_leaves_out_the_off_value(search: 
     """Of a null bias of 100 uA: its own size does, a hundredth of its standard deviation does not."""
     free = list_all_unknowns(search.model)
     place = [f.name for f in free].index("null_bias.current")
-    found = linearise(search.problem, free, np.zeros(len(free)))
+    fit = linearise(search.problem, free, np.zeros(len(free)))
 
     def move_bias(current: float) -> Hypothesis:
-        x = np.where(np.arange(len(free)) == place, (current - free[place].centre) / free[place].scale, found.x)
-        return search.judge_fit(("null_bias",), replace(found, x=x))
+        x = np.where(np.arange(len(free)) == place, (current - free[place].centre) / free[place].scale, fit.x)
+        return search.judge_fit(("null_bias",), replace(fit, x=x))
 
-    small = 0.01 * found.spread("null_bias.current")
+    small = 0.01 * fit.spread("null_bias.current")
     assert [shows_effect(load_model(), move_bias(current), "null_bias") for current in (1e-4, small)] == [True, False]
 
 
@@ -258,8 +260,8 @@ def test_of_two_effects_the_one_that_may_be_off_is_left_out() -> None:
 def test_an_explanation_that_needs_tolerances_of_no_healthy_unit_is_doubted(is_far: bool, verdict: str) -> None:
     """A lag of the pilot pressure, which is not in the catalogue, was called a coil lag with clogging, EXPLAINED."""
     base, best = make_judged((), 9000.0), make_judged(("coil_lag", "filter_clogging"), 1000.0, is_far=is_far)
-    found = decide_verdict(base, [best], [best], True, Marks(1.0, 1e-6, ()), {"xj": 2e-6})
-    assert found == (verdict, ("coil_lag", "filter_clogging"))
+    assert decide_verdict(base, [best], [best], True, Marks(1.0, 1e-6, ()), {"xj": 2e-6}) == (
+        verdict, ("coil_lag", "filter_clogging"))
 
 
 def make_judged(effects: tuple[str, ...], cost: float, at_floor: bool | None = None, is_far: bool = False) -> Any:
@@ -299,8 +301,8 @@ def test_an_effect_that_spares_the_unit_far_tolerances_is_named(costs: tuple[flo
     base = make_judged((), 1000.0, at_floor=True, is_far=True)
     close = [make_judged((name,), cost) for name, cost in zip(("soft_spline", "backlash"), costs, strict=False)]
     unseen = [900.0] * (1 + len(close))
-    found, named = decide_verdict(base, close, close, False, Marks(1.0, 1e-6, ()), {"xj": 2e-6}, unseen)
-    assert found == verdict and named[:1] == (("soft_spline",) if costs else ())
+    decision, effects = decide_verdict(base, close, close, False, Marks(1.0, 1e-6, ()), {"xj": 2e-6}, unseen)
+    assert decision == verdict and effects[:1] == (("soft_spline",) if costs else ())
 
 
 def test_the_page_shows_the_decision_procedure_of_the_code() -> None:
@@ -315,9 +317,9 @@ def candidate(effect: str, *beside: str) -> Candidate:
 
 def test_a_pair_is_shown_once_with_the_sizes_of_both() -> None:
     both = (candidate("a", "b"), candidate("b", "a"), candidate("c", "a"), candidate("d"))
-    shown = Answer(cast(Any, None), both, {}, (), (), (), ()).explanations
-    assert [(c.effect, c.beside) for c in shown] == [("a", ("b",)), ("c", ("a",)), ("d", ())]
-    assert set(shown[0].parameters) == {"a.size", "b.size"} and set(both[0].parameters) == {"a.size"}
+    explanations = Answer(cast(Any, None), both, {}, (), (), (), ()).explanations
+    assert [(c.effect, c.beside) for c in explanations] == [("a", ("b",)), ("c", ("a",)), ("d", ())]
+    assert set(explanations[0].parameters) == {"a.size", "b.size"} and set(both[0].parameters) == {"a.size"}
 
 
 def record_unit(changes: dict[str, float], seed: int) -> Trace:
@@ -387,15 +389,17 @@ def test_the_regression_ranks_the_right_term_first(name: str) -> None:
 
 
 def test_what_the_residual_follows_is_tested_on_rows_that_the_curve_never_saw() -> None:
-    there, unseen = ({name: sample_states(seed)[name] for name in ("position", "speed", "pressure", "spool", "current")}
-                     for seed in (2, 3))
-    product, held = (states["position"] * states["pressure"] / 1e4 for states in (there, unseen))
+    fit_states, holdout_states = (
+        {name: sample_states(seed)[name] for name in ("position", "speed", "pressure", "spool", "current")}
+        for seed in (2, 3))
+    product, holdout_product = (
+        states["position"] * states["pressure"] / 1e4 for states in (fit_states, holdout_states))
     noise = np.random.default_rng(5).standard_normal(len(product))
-    found = find_dependences(product + 0.3 * product.std() * noise, there, (held, unseen))
-    assert found[0].states == ("position", "pressure") and found[0].share > 0.5
-    assert found[0].holdout is not None and found[0].holdout > 0.4 and found[0].p_value < 0.02
+    dependences = find_dependences(product + 0.3 * product.std() * noise, fit_states, (holdout_product, holdout_states))
+    assert dependences[0].states == ("position", "pressure") and dependences[0].share > 0.5
+    assert dependences[0].holdout is not None and dependences[0].holdout > 0.4 and dependences[0].p_value < 0.02
     coloured = np.convolve(noise, np.ones(200), "same")
-    assert find_dependences(coloured, there, None)[0].p_value > 0.05, "slow noise follows nothing"
+    assert find_dependences(coloured, fit_states, None)[0].p_value > 0.05, "slow noise follows nothing"
 
 
 SIZES = {"cogging": 400.0, "cogging_length": 2e-3, "cogging_phase": 0.3, "drag_square": 3e5, "friction_run_in": 200.0,
@@ -415,9 +419,9 @@ def test_a_written_law_is_what_the_library_replayed(place: str, tmp_path: Path) 
     with registered_library():
         text = write_effects({place: "own_law"}, terms, values, "A law.")
         assert load_effects(write_file(tmp_path / "law.py", text)) == ["own_law"]
-        library = Model().with_effects([LIBRARY[place]]).replace(
+        library_model = Model().with_effects([LIBRARY[place]]).replace(
             {name_parameter(t, f): values[f] for t in terms for f in t.fields})
-        own = Model().with_effects(["own_law"])
+        file_model = Model().with_effects(["own_law"])
         signal = {"force": Drag(0.0, 0.0, 800.0, 500.0), "flow": Line(1e6, 2e9, 2e7, 1e6), "current": 3e-4}[place]
 
         def run(model: Model) -> list[object]:
@@ -431,8 +435,8 @@ def test_a_written_law_is_what_the_library_replayed(place: str, tmp_path: Path) 
                 out.append(x)
             return out
 
-        written = run(own.replace({f"own_law.{f}": v for f, v in values.items()}))
-        assert run(library) == written != run(own) == [signal] * 300
+        outputs = run(file_model.replace({f"own_law.{f}": v for f, v in values.items()}))
+        assert run(library_model) == outputs != run(file_model) == [signal] * 300
 
 
 def test_a_law_reads_as_a_formula() -> None:
@@ -507,12 +511,12 @@ def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> N
     with restored_catalogue():
         load_effects(write_file(tmp_path / "hidden.py", HIDDEN_LAW.format(port=outside.port, law=outside.law)))
         traces = record_runs(Model().replace({"hidden_law.size": outside.size}))
-    found = search_law(traces)
-    law = found.law
+    law_search = search_law(traces)
+    law = law_search.law
     assert law is not None and law.holds and [term.name for term in law.terms] == [outside.term], law
-    assert all(error < 1.2 * found.floor[signal] for signal, error in law.holdout.items())
-    worst = max(found.floor, key=lambda s: found.base.errors[s] / found.floor[s])
-    assert law.hypothesis.errors[worst] < 0.5 * found.base.errors[worst]
+    assert all(error < 1.2 * law_search.floor[signal] for signal, error in law.holdout.items())
+    worst = max(law_search.floor, key=lambda s: law_search.base.errors[s] / law_search.floor[s])
+    assert law.hypothesis.errors[worst] < 0.5 * law_search.base.errors[worst]
     assert law.values[outside.term].low < outside.size < law.values[outside.term].high
     names = write_law_file(tmp_path / "law.py", law.terms, law.values, law.reason)
     assert load_effects(tmp_path / "law.py") == list(names.values()) == [f"missing_{law.terms[0].place}"]
@@ -520,8 +524,8 @@ def test_a_hidden_law_is_found_named_and_written(name: str, tmp_path: Path) -> N
 
 
 def test_a_healthy_run_has_no_law() -> None:
-    found = search_law(record_runs(Model()))
-    assert found.law is None and not any(m.visible for m in found.missing)
+    law_search = search_law(record_runs(Model()))
+    assert law_search.law is None and not any(m.visible for m in law_search.missing)
 
 
 Row = dict[str, Any]
@@ -596,8 +600,8 @@ def test_the_smallest_size_that_is_named_is_found_from_anywhere(unit: Unit, firs
     one = Unit(**{**vars(unit), "effects": ("constant_load", "coil_lag")})
     rows = play_rounds(one, first, lambda job: job.rung <= last)
     for claim in summarise_injections(one, rows):
-        expected = None if last < 0 else measure_size(unit.model, claim.effect, last)
-        assert claim.smallest == expected
+        size = None if last < 0 else measure_size(unit.model, claim.effect, last)
+        assert claim.smallest == size
         assert claim.named is None if last < 0 else claim.named and (claim.named.good, claim.named.of) == (10, 10)
         misses = sum(row["effect"] == claim.effect and not row["is_named"] for row in rows)
         assert dict(claim.taken_for) == ({f"{claim.effect} and sensor_gain (AMBIGUOUS)": misses} if misses else {})
@@ -616,10 +620,10 @@ def test_a_size_counts_with_one_miss_and_not_with_two(unit: Unit) -> None:
 @pytest.mark.usefixtures("few_effects")
 def test_the_command_tells_claims_and_resumes(files: dict[str, Path], monkeypatch: pytest.MonkeyPatch,
                                               tmp_path: Path) -> None:
-    made: list[Injection] = []
+    jobs: list[Injection] = []
 
     def judge(job: Injection, unit: Unit) -> Row:
-        made.append(job)
+        jobs.append(job)
         return answer(job, job.rung <= 2)
 
     monkeypatch.setattr(rounds, "judge_injection", judge)
@@ -627,21 +631,21 @@ def test_the_command_tells_claims_and_resumes(files: dict[str, Path], monkeypatc
                  "--workers", "1", "--out", tmp_path / "page.html")
     result = rig(*arguments, "--json")
     claims = {claim["effect"]: claim for claim in result.json["sensitivity"]}
-    assert set(claims) == {"coil_lag", "constant_load"} and made
+    assert set(claims) == {"coil_lag", "constant_load"} and jobs
     lag = claims["coil_lag"]
     assert lag["parameter"] == "coil_lag.time" and lag["unit"] == "s" and lag["named"]["good"] == TRIALS
     assert lag["smallest_named"] == max(c["size"] for c in lag["counts"] if c["of"] == TRIALS and c["named"] == TRIALS
                                         and c["size"] <= lag["smallest_named"])
     page = (tmp_path / "page.html").read_text()
     assert "Sizes that are named" in page and "coil_lag and sensor_gain (AMBIGUOUS)" in page
-    made.clear()
-    assert "Each effect was hidden in this unit" in rig(*arguments).out and made == []
+    jobs.clear()
+    assert "Each effect was hidden in this unit" in rig(*arguments).out and jobs == []
 
 
 @pytest.mark.usefixtures("few_effects")
 def test_nothing_is_claimed_of_a_unit_that_no_model_explains(explained: tuple[Runs, Answer]) -> None:
-    runs, found = explained
-    e = found.explanation
+    runs, explain_answer = explained
+    e = explain_answer.explanation
     worse = replace(e.base, ratio=dict.fromkeys(e.base.ratio, 5.0))
-    unexplained = replace(found, explanation=replace(e, verdict="UNEXPLAINED", base=worse, ledger=(worse,)))
+    unexplained = replace(explain_answer, explanation=replace(e, verdict="UNEXPLAINED", base=worse, ledger=(worse,)))
     assert "more than noise is left" in catch_refusal(describe_unit, runs, unexplained)
