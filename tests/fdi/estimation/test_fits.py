@@ -319,9 +319,9 @@ def test_a_known_load_does_not_show_the_pressure_but_the_area() -> None:
 
 
 def test_a_stop_shows_how_far_flapper_and_spool_move() -> None:
-    both = np.where(T > 0.2, 5e-3, 0.0)  # m, the command that brings both to their stops
-    gentle, fast = find_flat({}, "xj"), find_flat({"torque_motor.gain": 2.5}, "xj", both)
-    assert [way in found for found in (gentle, fast) for way in (FLAPPER, SPOOL_WAY)] == [True, True, False, False]
+    command = np.where(T > 0.2, 5e-3, 0.0)  # m, brings both to their stops
+    gentle, fast = find_flat({}, "xj"), find_flat({"torque_motor.gain": 2.5}, "xj", command)
+    assert [way in flat for flat in (gentle, fast) for way in (FLAPPER, SPOOL_WAY)] == [True, True, False, False]
 
 
 def test_leakage_makes_up_for_pressure_gain() -> None:
@@ -353,17 +353,17 @@ class RoughSum(Problem):
     def predict_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
         return 10.0 * x.sum(axis=1)[:, None, None] + 0.15 * np.sign(np.sin(300.0 * x[:, :1, None] + np.arange(100.0)))
 
-    def subtract_measurements(self, predicted: Floats) -> Floats:
-        return predicted
+    def subtract_measurements(self, predictions: Floats) -> Floats:
+        return predictions
 
 
 def test_only_the_tolerance_limits_a_size_that_no_signal_tells_from_it() -> None:
     """Of a plant of which no such directions are declared; the differences of the first fit see jumps alone."""
     free = [Free("tolerance", 0.0, 1.0, 1.0, -5.0, 5.0, 0.3), Free("size", 0.0, 1.0, np.inf, -50.0, 50.0, 0.05)]
     problem = RoughSum(load_model("ema"), record_healthy(), (white_noise(1.0),))
-    begun = linearise(problem, free, np.array([2.0, -2.0]))
-    found = finish_fit(problem, begun, 5)
-    assert begun.spread("size") < 0.2 and found.spread("size") > 0.6 and abs(found.x).max() < 0.5
+    first_fit = linearise(problem, free, np.array([2.0, -2.0]))
+    fit = finish_fit(problem, first_fit, 5)
+    assert first_fit.spread("size") < 0.2 and fit.spread("size") > 0.6 and abs(fit.x).max() < 0.5
 
 
 FLOOR = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
@@ -414,15 +414,16 @@ def test_scan_of_a_step_test_finds_the_size_at_which_a_backlash_bounces_like_the
     search = Search(model, trace, [], ["backlash"], 1)
     assert 200 <= search.problem.trace.usable.sum() < 0.3 * len(trace)
     healthy = linearise(search.problem, list_all_unknowns(search.model), np.zeros(4))
-    found = scan_effects(search.problem, [healthy], ["backlash"])[0]
-    u = [f.name for f in found.free].index("screw.backlash")
-    assert found.free[u].centre + found.free[u].scale * found.x[u] == pytest.approx(1e-4, rel=0.3)  # else a tenth of it
+    prospect = scan_effects(search.problem, [healthy], ["backlash"])[0]
+    u = [f.name for f in prospect.free].index("screw.backlash")
+    size = prospect.free[u].centre + prospect.free[u].scale * prospect.x[u]
+    assert size == pytest.approx(1e-4, rel=0.3)  # else a tenth of it
 
 
 def test_error_that_is_watched_while_a_backlash_is_added_falls_to_the_noise() -> None:
-    found = refit_effects(load_model("ema"), ["backlash"], _record_motor({"screw.backlash": 1e-4}))
-    assert max(found.last.hypothesis.errors[s] / found.floor[s] for s in found.floor) < 1.3
-    assert found.last.hypothesis.fit.values["screw.backlash"] == pytest.approx(1e-4, rel=0.05)
+    refit = refit_effects(load_model("ema"), ["backlash"], _record_motor({"screw.backlash": 1e-4}))
+    assert max(refit.last.hypothesis.errors[s] / refit.floor[s] for s in refit.floor) < 1.3
+    assert refit.last.hypothesis.fit.values["screw.backlash"] == pytest.approx(1e-4, rel=0.05)
 
 
 def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
@@ -435,9 +436,9 @@ def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
     assert rest[:1150].all() and not rest[1300:2490].any() and rest[2550:].all()  # and until a replay has forgotten it
 
 
-@pytest.mark.parametrize(("x", "moved"), [(2.0, 4.0), (0.0, None), (-2.0, None)])
-def test_no_factor_leads_from_zero_or_past_it(x: float, moved: float | None) -> None:
+@pytest.mark.parametrize(("x", "new_x"), [(2.0, 4.0), (0.0, None), (-2.0, None)])
+def test_no_factor_leads_from_zero_or_past_it(x: float, new_x: float | None) -> None:
     """`rig explain` ended with a division by zero where a size that trades with others was fitted to 0."""
     free = [Free("jack.leakage", 0.0, 1.0, np.inf, -10.0, 10.0, 0.1)]
-    found = scale_to(free, np.array([x]), {"jack.leakage": 1.0}, "jack.leakage", 4.0)
-    assert (found is None) is (moved is None) and (found is None or found[0] == pytest.approx(moved))
+    point = scale_to(free, np.array([x]), {"jack.leakage": 1.0}, "jack.leakage", 4.0)
+    assert (point is None) is (new_x is None) and (point is None or point[0] == pytest.approx(new_x))

@@ -35,22 +35,22 @@ def test_a_perfect_model_has_ratio_one(colour: str, rows: int, scatter: float) -
 @pytest.mark.parametrize("colour", ["white", "hum"])
 def test_what_the_model_lacks_in_both_runs_is_no_noise(colour: str) -> None:
     r, repeat = pair(0, colour)
-    shared = 20 * np.sin(np.arange(ROWS) / 300)
-    assert floor_from_repeats(r + shared, [repeat + shared]).value == pytest.approx(1.0, abs=0.06)
+    model_error = 20 * np.sin(np.arange(ROWS) / 300)
+    assert floor_from_repeats(r + model_error, [repeat + model_error]).value == pytest.approx(1.0, abs=0.06)
 
 
 @pytest.mark.parametrize(("part", "least"), [(0.3, 0.02), (0.6, 0.05), (0.8, 0.1)])
 def test_stick_slip_that_comes_at_other_times_is_no_noise(part: float, least: float) -> None:
     """Errors that differ between the runs, ten times the noise, in 30 to 80 % of the windows."""
-    found = []
+    floors = []
     for seed in range(8):
         r, repeat = pair(seed, "white")
         rng = np.random.default_rng(seed)
         events = np.repeat(np.where(rng.random(ROWS // 100) < part, rng.exponential(10, ROWS // 100), 0.0), 100)
         slips = events * np.tanh(np.cumsum(rng.standard_normal(ROWS)) / 20)
-        found.append(floor_from_repeats(r + slips, [repeat - slips]))
-    assert np.mean([f.value for f in found]) == pytest.approx(1.0, abs=least)
-    assert found[0].difference > 3.0 and found[0].share < 1.05 - 0.6 * part  # told apart from the noise
+        floors.append(floor_from_repeats(r + slips, [repeat - slips]))
+    assert np.mean([f.value for f in floors]) == pytest.approx(1.0, abs=least)
+    assert floors[0].difference > 3.0 and floors[0].share < 1.05 - 0.6 * part  # told apart from the noise
 
 
 def test_hum_of_one_phase_is_found_and_counted() -> None:
@@ -58,9 +58,9 @@ def test_hum_of_one_phase_is_found_and_counted() -> None:
     k = np.arange(ROWS)
     r, repeat = pair(3, "white")
     hum = 0.8 * np.sin(2 * np.pi * 0.05 * k + 1.0)
-    found = floor_from_repeats(r + hum, [repeat + hum])
-    assert found.hum == pytest.approx(0.8 / np.sqrt(2), rel=0.1)
-    assert found.value == pytest.approx(np.hypot(1.0, 0.8 / np.sqrt(2)), rel=0.03)
+    floor = floor_from_repeats(r + hum, [repeat + hum])
+    assert floor.hum == pytest.approx(0.8 / np.sqrt(2), rel=0.1)
+    assert floor.value == pytest.approx(np.hypot(1.0, 0.8 / np.sqrt(2)), rel=0.03)
     fast = r + 0.3 * np.sin(2 * np.pi * 0.4 * k)
     none, one, more = ([f for f, _ in find_hum_lines(runs, 1e-3)]
                        for runs in ([r, repeat], [r + hum, repeat + hum], [fast, fast]))
