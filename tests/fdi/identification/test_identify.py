@@ -38,8 +38,8 @@ MM = 1e-3
 
 
 def sample_plant() -> dict[str, float]:
-    drawn = sample_actuator(5, scatter=0.0)
-    return {symbol: drawn[symbol] for symbol in SIZED}
+    actuator = sample_actuator(5, scatter=0.0)
+    return {symbol: actuator[symbol] for symbol in SIZED}
 
 
 def measure(com: np.ndarray, load: np.ndarray, seed: int, name: str) -> Trace:
@@ -63,36 +63,38 @@ def runs() -> tuple[Trace, Trace, Trace]:
             measure(last, np.where(np.arange(2000) > 900, -4e3, 0.0), 3, "held"))
 
 
-def identify(fitted: list[Trace], held_out: list[Trace], free: object = FREE, plant: str = "eha") -> Identification:
+def identify(fitted_runs: list[Trace], held_out_runs: list[Trace], free: object = FREE, plant: str = "eha"
+             ) -> Identification:
     """Of a plant; `free`: what a data sheet says, None for what the plant declares."""
     model = load_model(plant)
     ranges = parse_free_parameters(free, model, "test") if free else read_free_parameters(model, None)
-    own = read_identification_runs(model, ranges, fitted, held_out)
-    return identify_model(own.model, ranges, own.fitted, own.held_out, own.sources)
+    runs = read_identification_runs(model, ranges, fitted_runs, held_out_runs)
+    return identify_model(runs.model, ranges, runs.fitted, runs.held_out, runs.sources)
 
 
 @pytest.fixture(scope="module")
-def found(runs: tuple[Trace, Trace, Trace]) -> Identification:
+def identification(runs: tuple[Trace, Trace, Trace]) -> Identification:
     return identify(list(runs[:2]), [runs[2]])
 
 
-def test_actuator_of_twice_the_size_is_identified(found: Identification) -> None:
+def test_actuator_of_twice_the_size_is_identified(identification: Identification) -> None:
     truth = {SYMBOLS[symbol]: value for symbol, value in sample_plant().items()}
-    assert found.verdict == "IDENTIFIED", found.reason
-    assert all(e.low <= truth[e.name] <= e.high < e.low + 0.1 * e.value for e in found.estimates)
-    assert max(e.ratio for e in found.holdouts) <= 1.1
-    assert max(e.before["p12"] / e.floor["p12"] for e in found.holdouts) > 5.0
-    assert found.model["controller.proportional_gain"] == pytest.approx(sample_plant()["GAP"], rel=1e-5)
+    assert identification.verdict == "IDENTIFIED", identification.reason
+    assert all(e.low <= truth[e.name] <= e.high < e.low + 0.1 * e.value for e in identification.estimates)
+    assert max(e.ratio for e in identification.holdouts) <= 1.1
+    assert max(e.before["p12"] / e.floor["p12"] for e in identification.holdouts) > 5.0
+    assert identification.model["controller.proportional_gain"] == pytest.approx(sample_plant()["GAP"], rel=1e-5)
 
 
-def test_stops_at_the_wrong_moment_in_a_fitted_run_leave_doubt(found: Identification) -> None:
-    first, *others = found.errors
+def test_stops_at_the_wrong_moment_in_a_fitted_run_leave_doubt(identification: Identification) -> None:
+    first, *others = identification.errors
     late = first._replace(decided={s: 2.5 * first.floor[s] for s in first.after})
-    verdict, reason = decide_verdict(found.estimates, [late, *others])
+    verdict, reason = decide_verdict(identification.estimates, [late, *others])
     assert verdict == "PARTLY" and "2.5 noise floors" in reason and first.source.file in reason
-    assert "wrong moment" in describe_identification(replace(found, verdict=verdict, reason=reason))
-    held = others[-1]._replace(after={s: 2.5 * floor for s, floor in others[-1].floor.items()})
-    assert held.is_held_out and decide_verdict(found.estimates, [first, *others[:-1], held])[0] == "IDENTIFIED"
+    assert "wrong moment" in describe_identification(replace(identification, verdict=verdict, reason=reason))
+    holdout = others[-1]._replace(after={s: 2.5 * floor for s, floor in others[-1].floor.items()})
+    assert holdout.is_held_out and decide_verdict(
+        identification.estimates, [first, *others[:-1], holdout])[0] == "IDENTIFIED"
 
 
 def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, Trace], here: Path,
@@ -101,42 +103,42 @@ def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, 
     runs[1].write_csv(here / "stops.csv")
     (here / "sheet.toml").write_text("[identify.jack]\narea = 1.3\ntravel = 6\n[identify.valve]\nflow_gain = 6\n"
                                          "[identify.supply]\npressure = 3\n")
-    told = answer("identify", "stops.csv", "--model", "sheet.toml", status=1)
-    area = told["parameters"]["jack.area"]
-    assert told["verdict"] == "UNEXPLAINED" and "noise floors" in told["reason"]
+    identification = answer("identify", "stops.csv", "--model", "sheet.toml", status=1)
+    area = identification["parameters"]["jack.area"]
+    assert identification["verdict"] == "UNEXPLAINED" and "noise floors" in identification["reason"]
     assert area["identifiable"] and area["high"] == area["range"][1] == pytest.approx(area["value"], rel=0.02)
-    assert [told["parameters"][name]["at_bound"] for name in ("jack.area", "jack.travel", "supply.pressure")] == [
-        True, False, False]
+    assert [identification["parameters"][name]["at_bound"]
+            for name in ("jack.area", "jack.travel", "supply.pressure")] == [True, False, False]
     assert not Path("identified.toml").exists() and Path("identified.html").exists()
     result = rig("identify", "stops.csv", "--model", "sheet.toml", "--out", "mine.toml")
-    shown = " ".join(result.out.split())
-    assert result.status == 1 and "jack.area: the interval reaches the end of the data sheet's range" in shown
-    assert "mine.toml was written because of --out; its parameters do not explain the runs" in shown
+    text = " ".join(result.out.split())
+    assert result.status == 1 and "jack.area: the interval reaches the end of the data sheet's range" in text
+    assert "mine.toml was written because of --out; its parameters do not explain the runs" in text
 
 
-def test_model_file_is_read_by_every_command(found: Identification, runs: tuple[Trace, Trace, Trace],
+def test_model_file_is_read_by_every_command(identification: Identification, runs: tuple[Trace, Trace, Trace],
                                              tmp_path: Path) -> None:
-    path, held = tmp_path / "mine.toml", tmp_path / "held.csv"
-    named = replace(found.model, name="mine")
-    write_identified_model(replace(found, model=named), path, "rig identify", "2026-01-01")
-    assert load_model(path) == named and load_model(path).nominal["jack.area"] == named["jack.area"]
+    path, holdout = tmp_path / "mine.toml", tmp_path / "held.csv"
+    model = replace(identification.model, name="mine")
+    write_identified_model(replace(identification, model=model), path, "rig identify", "2026-01-01")
+    assert load_model(path) == model and load_model(path).nominal["jack.area"] == model["jack.area"]
     origin = read_provenance(path).identification
     assert (origin["runs"], origin["holdouts"]) == (["wave", "stops"], ["held"])
     assert "95 %" in path.read_text()
-    runs[2].write_csv(held)
-    assert answer("compare", held, "--model", path)["verdict"] == "WITHIN_FLOOR"
-    diagnosed = answer("fdi", held, "--model", path)
-    assert diagnosed["verdict"] == "ACCEPTABLE" and any("no bands" in note for note in diagnosed["notes"])
+    runs[2].write_csv(holdout)
+    assert answer("compare", holdout, "--model", path)["verdict"] == "WITHIN_FLOOR"
+    diagnosis = answer("fdi", holdout, "--model", path)
+    assert diagnosis["verdict"] == "ACCEPTABLE" and any("no bands" in note for note in diagnosis["notes"])
 
 
 def test_area_needs_a_known_load(runs: tuple[Trace, Trace, Trace]) -> None:
-    found = identify([runs[0]], [], {"jack": {"area": 5.0, "mass": 8.0, "static_friction": 8.0,
-                                               "dynamic_friction": 8.0, "damping": 8.0, "leakage": 10.0},
-                                     "valve": {"flow_gain": 6.0}})
-    area = next(e for e in found.estimates if e.name == "jack.area")
-    assert found.verdict in ("PARTLY", "CANNOT_TELL")
+    identification = identify([runs[0]], [], {"jack": {"area": 5.0, "mass": 8.0, "static_friction": 8.0,
+                                                       "dynamic_friction": 8.0, "damping": 8.0, "leakage": 10.0},
+                                              "valve": {"flow_gain": 6.0}})
+    area = next(e for e in identification.estimates if e.name == "jack.area")
+    assert identification.verdict in ("PARTLY", "CANNOT_TELL")
     assert not area.is_identifiable and area.high / area.low > 3.0
-    assert {a.parameter: a.experiment for a in found.advice}["jack.area"] == "load"
+    assert {a.parameter: a.experiment for a in identification.advice}["jack.area"] == "load"
 
 
 @pytest.mark.parametrize(("signals", "is_known"), [(["xj"], False), (["xj", "p12"], True)])
@@ -162,10 +164,10 @@ def test_long_run_is_fitted_by_parts_and_an_end_stop_that_it_never_met_is_not_at
     t = np.arange(8000) * 1e-3
     com = np.where(t < 2.0, 0.0, 4 * MM * np.sin(2 * np.pi * t))
     run = measure(com, np.zeros(len(com)), 6, "long")
-    found = identify([run], [], {"valve": {"flow_gain": 6.0}, "jack": {"travel": [0.012, 0.05]}})
-    assert any("long: fitted to" in note and "of 8 s" in note for note in found.notes)
-    assert len(found.residuals[0][1][0]) == len(run)  # judged on all of it
-    flow, travel = found.estimates
+    identification = identify([run], [], {"valve": {"flow_gain": 6.0}, "jack": {"travel": [0.012, 0.05]}})
+    assert any("long: fitted to" in note and "of 8 s" in note for note in identification.notes)
+    assert len(identification.residuals[0][1][0]) == len(run)  # judged on all of it
+    flow, travel = identification.estimates
     assert [(e.is_identifiable, e.is_at_bound) for e in (flow, travel)] == [(True, False), (False, False)]
     assert travel.low < 0.013 and travel.high == 0.05
 
@@ -185,10 +187,11 @@ def record_motor(unit: dict[str, float], *more: Segment, seed: int = 1) -> Trace
 def test_motor_that_rests_is_identified() -> None:
     """Dry friction at rest has any value, so rests are not compared; of short steps the beginnings show the mass."""
     unit = {"surface.mass": 300.0, "surface.damping": 3500.0, "surface.friction": 180.0}
-    found = identify([record_motor(unit, Hold(time=1.0))], [], None, "ema")
-    assert found.verdict in ("IDENTIFIED", "PARTLY") and any("at rest" in note for note in found.notes)
-    held = {e.name: e.low <= unit[e.name] <= e.high for e in found.estimates if e.name in unit}
-    assert held == dict.fromkeys(unit, True)
+    identification = identify([record_motor(unit, Hold(time=1.0))], [], None, "ema")
+    assert identification.verdict in ("IDENTIFIED", "PARTLY") and any(
+        "at rest" in note for note in identification.notes)
+    is_covered = {e.name: e.low <= unit[e.name] <= e.high for e in identification.estimates if e.name in unit}
+    assert is_covered == dict.fromkeys(unit, True)
 
 
 def test_what_no_known_force_shows_has_a_wide_interval() -> None:
@@ -196,17 +199,18 @@ def test_what_no_known_force_shows_has_a_wide_interval() -> None:
     unit = load_model("ema").replace({"surface.friction": 130.0})
     table = {"motor": {"torque_constant": 2.0, "inertia": 2.0}, "screw": {"compliance": 2.0},
              "surface": {"mass": 2.0, "damping": 2.0, "friction": 2.0}}
-    found = identify([record_motor({"surface.friction": 130.0}, LONG, seed=3)], [], table, "ema")
-    assert found.verdict in ("PARTLY", "IDENTIFIED")
-    assert all(e.low < unit[e.name] < e.high and e.share > 0.05 for e in found.estimates)
+    identification = identify([record_motor({"surface.friction": 130.0}, LONG, seed=3)], [], table, "ema")
+    assert identification.verdict in ("PARTLY", "IDENTIFIED")
+    assert all(e.low < unit[e.name] < e.high and e.share > 0.05 for e in identification.estimates)
 
 
 def test_run_at_rest_identifies_nothing() -> None:
     still = measure(np.zeros(800), np.zeros(800), 4, "still")
-    found = identify([still], [])
-    assert (found.verdict, found.model) == ("CANNOT_TELL", load_model()) and "at rest" in found.reason
-    assert not any(e.is_identifiable for e in found.estimates)
-    assert {a.parameter for a in found.advice} == {e.name for e in found.estimates}
+    identification = identify([still], [])
+    assert (identification.verdict, identification.model) == (
+        "CANNOT_TELL", load_model()) and "at rest" in identification.reason
+    assert not any(e.is_identifiable for e in identification.estimates)
+    assert {a.parameter for a in identification.advice} == {e.name for e in identification.estimates}
 
 
 @pytest.mark.parametrize(("table", "field"), [
@@ -228,11 +232,11 @@ def test_ranges_of_a_model_file(tmp_path: Path) -> None:
     assert len(read_free_parameters(load_model(), None)) > 10
 
 
-@pytest.mark.parametrize(("fitted", "held_out", "signals", "option"), [
+@pytest.mark.parametrize(("fitted_count", "held_out_count", "signals", "option"), [
     (1, 1, None, "--holdout"), (2, 0, None, "other runs"), (1, 0, ["speed"], "--signals")])  # so many times a run
-def test_runs_that_cannot_be_used(runs: tuple[Trace, Trace, Trace], fitted: int, held_out: int,
+def test_runs_that_cannot_be_used(runs: tuple[Trace, Trace, Trace], fitted_count: int, held_out_count: int,
                                   signals: list[str] | None, option: str, tmp_path: Path) -> None:
     ranges = parse_free_parameters(FREE, load_model(), "test")
-    assert option in catch_refusal(read_identification_runs, load_model(), ranges, [runs[0]] * fitted,
-                                   [runs[0]] * held_out, signals)
+    assert option in catch_refusal(read_identification_runs, load_model(), ranges, [runs[0]] * fitted_count,
+                                   [runs[0]] * held_out_count, signals)
     assert "none.csv" in refuse("identify", tmp_path / "none.csv")
