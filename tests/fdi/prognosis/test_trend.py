@@ -29,8 +29,8 @@ SIGMA = 0.4  # N
 
 def estimates(sizes: Sequence[float], sigma: float = SIGMA) -> list[Estimate]:
     """Sizes of spool friction as measured, N."""
-    seen = np.asarray(sizes) + sigma * RNG.standard_normal(len(sizes))
-    return [Estimate(float(x), float(x - 1.96 * sigma), float(x + 1.96 * sigma)) for x in seen]
+    noisy_sizes = np.asarray(sizes) + sigma * RNG.standard_normal(len(sizes))
+    return [Estimate(float(x), float(x - 1.96 * sigma), float(x + 1.96 * sigma)) for x in noisy_sizes]
 
 
 def friction(sizes: Sequence[float], times: np.ndarray = WEEKS) -> Trend:
@@ -64,15 +64,15 @@ def test_a_table_of_dates(tmp_path: Path) -> None:
 def test_the_law_is_recognised_and_the_time_left_found(law: str) -> None:
     x = WEEKS / 140.0  # MaxBand at 140 days
     grown = {"linear": x, "exponential": np.expm1(4.0 * x) / np.expm1(4.0), "power": np.sqrt(x)}[law]
-    found = friction(5.0 + 65.0 * grown)
-    left = found.remaining["non_nominal"]
-    assert found.verdict == "TREND" and not found.breaks and found.used.all()
+    trend = friction(5.0 + 65.0 * grown)
+    remaining_life = trend.remaining["non_nominal"]
+    assert trend.verdict == "TREND" and not trend.breaks and trend.used.all()
     alike = {law, "runaway"} if law == "exponential" else {law}  # faster and faster, both
-    assert sum(found.laws[name] for name in alike) > 0.5
-    assert left.low <= 140.0 - WEEKS[-1] <= left.high and left.high < 500.0
-    assert found.remaining["maintenance"].value <= left.value
-    assert found.now.low <= 5.0 + 65.0 * grown[-1] <= found.now.high
-    assert left.compute_probability_within(left.value) == pytest.approx(0.5, abs=0.01)
+    assert sum(trend.laws[name] for name in alike) > 0.5
+    assert remaining_life.low <= 140.0 - WEEKS[-1] <= remaining_life.high and remaining_life.high < 500.0
+    assert trend.remaining["maintenance"].value <= remaining_life.value
+    assert trend.now.low <= 5.0 + 65.0 * grown[-1] <= trend.now.high
+    assert remaining_life.compute_probability_within(remaining_life.value) == pytest.approx(0.5, abs=0.01)
 
 
 def test_what_does_not_grow_has_no_trend_and_what_is_past_a_limit_no_time_left() -> None:
@@ -110,9 +110,9 @@ def test_a_level_names_its_reason(changes: dict[str, Any], words: str) -> None:
 LINE = 5.0 + 2.0 * np.arange(12)
 
 
-def find_median(found: Trend) -> float:
+def find_median(trend: Trend) -> float:
     """Days until MaxBand."""
-    return found.remaining["non_nominal"].value
+    return trend.remaining["non_nominal"].value
 
 
 SHOWS: dict[str, Callable[[Trend, Trend, int], bool]] = {  # of each kind of break, and of the trend without it
@@ -132,10 +132,10 @@ TIMES = {"step within a day": np.insert(WEEKS, 6, WEEKS[5])}  # the trace before
     ("step within a day", 6, LINE + 18.0 * (np.arange(12) >= 6)), ("repair", 8, np.where(np.arange(12) < 8, LINE, 5.0)),
     ("last above", 11, LINE + 20.0 * (np.arange(12) == 11)), ("last below", 11, LINE - 20.0 * (np.arange(12) == 11))])
 def test_breaks(kind: str, row: int, sizes: Sequence[float]) -> None:
-    found = friction(sizes, TIMES.get(kind, WEEKS))
-    assert [(b.kind, b.row) for b in found.breaks] == [(kind.split()[0], row)]
-    assert found.breaks[0].size == pytest.approx(sizes[row] - LINE[row], abs=4.0)
-    assert SHOWS[kind](found, friction(LINE), row)
+    trend = friction(sizes, TIMES.get(kind, WEEKS))
+    assert [(b.kind, b.row) for b in trend.breaks] == [(kind.split()[0], row)]
+    assert trend.breaks[0].size == pytest.approx(sizes[row] - LINE[row], abs=4.0)
+    assert SHOWS[kind](trend, friction(LINE), row)
 
 
 def test_estimates_at_their_bound_only_say_not_more_than() -> None:
@@ -160,8 +160,8 @@ def test_the_command_on_an_earlier_answer(tmp_path: Path) -> None:
     assert result.status == 0 and fss["verdict"] == "TREND" and result.json["last"] == "2026-03-23"
     assert days["low"] <= days["value"] <= days["high"] and days["value_at"] > "2026-03-23"
     assert rig("trend", tmp_path / "b.json", "--json").json["trends"] == result.json["trends"]
-    shown = rig("trend", source, "--out", tmp_path / "x.html").out
-    assert all(word in shown for word in ("spool friction", "TREND", "MaxBand", "per month", "x.html"))
+    text = rig("trend", source, "--out", tmp_path / "x.html").out
+    assert all(word in text for word in ("spool friction", "TREND", "MaxBand", "per month", "x.html"))
     bad = points(tmp_path / "c.json", LINE + 25.0)
     assert rig("trend", bad, "--quiet", "--out", tmp_path / "x.png").status == 1  # past MidBand
     page = (tmp_path / "x.html").read_text()
@@ -191,11 +191,11 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert re.search(r"table.csv: date: expected .*dates.csv", catch_refusal(gathered))
     (folder / "dates.csv").write_text("file,date,hours\ntable.csv,2026-01-20,30\nown.mcap,,10\n"
                                       "named.csv,,20\nold.csv,2026-01-20,30\nbroken.csv,2026-01-20,30\n")
-    found = gathered()
-    assert [p.trace for p in found.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
-    assert [format_day(p.t) for p in found.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
-    assert [note.split(",")[0] for note in found.notes] == ["broken.csv left out: xj: expected a position",
-                                                            "old.csv is listed in dates.csv"]
+    trace_sizes = gathered()
+    assert [p.trace for p in trace_sizes.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
+    assert [format_day(p.t) for p in trace_sizes.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
+    assert [note.split(",")[0] for note in trace_sizes.notes] == ["broken.csv left out: xj: expected a position",
+                                                                  "old.csv is listed in dates.csv"]
     assert [p.t for p in gathered("hours").points] == [10.0, 20.0, 30.0]
     assert "flights" in catch_refusal(gathered, "flights")
 
@@ -203,10 +203,10 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     t = 1e-3 * np.arange(2000)
     command = np.where((t > 0.2) & (t < 1.0), 1e-3, 0.0) + 5e-4 * np.clip(t - 1.0, 0.0, 0.8)
-    made = simulate(load_model(), command, seed=4)
+    run = simulate(load_model(), command, seed=4)
     (tmp_path / "unit").mkdir()
-    there = {name: getattr(made, name) for name in ("com", "xj", "cor", "p12", "xs")}
-    Trace.from_columns(there, 1e-3, {}).write_csv(tmp_path / "unit" / "2026-01-05.csv")
+    columns = {name: getattr(run, name) for name in ("com", "xj", "cor", "p12", "xs")}
+    Trace.from_columns(columns, 1e-3, {}).write_csv(tmp_path / "unit" / "2026-01-05.csv")
     monkeypatch.setattr(unit_trend, "find_cache_folder", lambda: tmp_path / "cache")
     first = rig("trend", tmp_path / "unit", "--json")
     assert first.json["trends"]["filter_clogging"]["verdict"] == "TOO_FEW"
