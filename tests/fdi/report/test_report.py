@@ -84,11 +84,11 @@ def read_text(page: str) -> str:
 
 
 def test_it_needs_no_network(page: str) -> None:
-    seen = HtmlPage(page)
-    assert not seen.open and not {"link", "iframe", "img"} & set(seen.tags)
-    assert seen.tags.count("script") == 1 and '<script id="figure-script">' in page  # no src: the text is in the page
+    html = HtmlPage(page)
+    assert not html.open and not {"link", "iframe", "img"} & set(html.tags)
+    assert html.tags.count("script") == 1 and '<script id="figure-script">' in page  # no src: the text is in the page
     assert not re.search(r"\b(fetch|XMLHttpRequest|WebSocket|import)\b *\(", page)
-    assert all(address.startswith("#") for address in seen.addresses)
+    assert all(address.startswith("#") for address in html.addresses)
     assert not re.search(r"@import|url\((?!#)", page) and len(page) < 2_000_000
 
 
@@ -149,14 +149,14 @@ def test_single_missing_samples_leave_a_line_and_a_mark() -> None:
     values = np.sin(k / 10)
     # every second one: a line through single samples would have no stroke at all
     holes = np.where((k % 2 == 1) | ((k >= 60) & (k < 80)), np.nan, values)
-    sound, broken, lost = (
+    sound, broken, empty = (
         run_report.draw_signals(Trace.from_columns({"com": values, "xj": xj, "cor": values}, 1e-3, {}))
         for xj in (values, holes, np.full(100, np.nan)))
     line = vars(broken)["figure"].axes[0].lines[1].get_ydata()
     assert np.isnan(line).sum() == 22 and np.isnan(line[59:80]).all()  # and the last
     np.testing.assert_allclose(line[:59], 1e3 * values[:59], atol=10.0)
     assert drawing.RED in broken and drawing.RED not in sound
-    assert [ax.get_ylabel() for ax in vars(lost)["figure"].axes] == ["position [mm]", "current [mA]"], "of the command"
+    assert [ax.get_ylabel() for ax in vars(empty)["figure"].axes] == ["position [mm]", "current [mA]"], "of the command"
 
 
 def test_any_trace_has_a_report(log: Path, tmp_path: Path) -> None:
@@ -290,9 +290,9 @@ def test_every_kind_survives_a_value_that_could_not_be_measured_and_missing_samp
 
 
 def test_a_page_shows_each_failed_check_once() -> None:
-    failed = make_check("overshoot", 12.0, "%", 11.0, (0.5, 1.5))
-    trace = replace(make_trace(), checks=(failed, replace(failed, name="fine", passed=True),
-                                        replace(failed, name="b")))
+    check = make_check("overshoot", 12.0, "%", 11.0, (0.5, 1.5))
+    trace = replace(make_trace(), checks=(check, replace(check, name="fine", passed=True),
+                                        replace(check, name="b")))
     page = render_html(build_run_report(trace))
     assert "Failed checks" in page and page.count("Dashed: limits; red") == 2 and page.count("<script") == 1
     assert "Failed checks" not in render_html(build_run_report(replace(trace, checks=())))
@@ -314,8 +314,8 @@ TABLE = Table([Column("signal"), Column("error", "um", "right"), Column("floor f
 
 @pytest.fixture
 def whole() -> Report:
-    drawn = Figure("The residual stays within the green band.", lambda: '<svg id="drawing"><path d="M0 0"/></svg>')
-    items = [TABLE, Line("floor", "from 1 repeat"), Line("solver", "0.1 um", "doubtful"), drawn,
+    figure = Figure("The residual stays within the green band.", lambda: '<svg id="drawing"><path d="M0 0"/></svg>')
+    items = [TABLE, Line("floor", "from 1 repeat"), Line("solver", "0.1 um", "doubtful"), figure,
              Paragraph("Errors are RMS values."), Paragraph("only for a page", medium=Medium.PAGE),
              Paragraph("only for a terminal", medium=Medium.TERMINAL), Table([Column("no rows")], []),
              Listing("t,com,xj\n0,0,0", "run.csv", Medium.PAGE), Listing("*  *\n ** ", medium=Medium.TERMINAL)]
@@ -407,8 +407,8 @@ class _Level(IntEnum):
     ((1, math.nan), [1, None]), (np.array([1.0, np.nan]), [1.0, None]), (np.arange(2), [0, 1]),
     ({"a": {"b": np.nan}}, {"a": {"b": None}}), (Path("a/b"), "a/b")])
 def test_plain_values(value: Any, plain: Any) -> None:
-    found = to_plain(value)
-    assert found == plain and type(found) is type(plain)
+    output = to_plain(value)
+    assert output == plain and type(output) is type(plain)
     assert json.loads(to_json({"x": value}), parse_constant=pytest.fail) == {"x": plain}
 
 
@@ -502,9 +502,9 @@ def test_a_size_has_its_interval(case: str, words: str) -> None:
 
 def test_findings() -> None:
     by = {"by": "measure XS too", "between": ("a", "b")}
-    told = answer("AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b"), separate=by, pattern="a force")
-    plain, lines = ({line.label: line.text for line in describe_findings(given)}
-                    for given in (CASES["AMBIGUOUS"][0], told))
+    separable_case = answer("AMBIGUOUS", ("a", "b"), candidate("a"), candidate("b"), separate=by, pattern="a force")
+    plain, lines = ({line.label: line.text for line in describe_findings(case)}
+                    for case in (CASES["AMBIGUOUS"][0], separable_case))
     assert plain["to discriminate"].startswith("no sensor and no command")
     assert plain["not detectable"] == "sensor_gain (up to 0.0200) and sensor_offset (up to 100 um); " \
         "a stop would reveal sensor_gain and sensor_offset"
@@ -546,9 +546,10 @@ def update(helps: bool) -> ModelUpdate:
     steps = [SimpleNamespace(holdout=by, hypothesis=SimpleNamespace(errors=by)) for by in (ERROR, FLOOR)]
     refit = SimpleNamespace(helps=helps, steps=steps, last=steps[-1], floor=FLOOR,
                             search=SimpleNamespace(problem=SimpleNamespace(trace=SimpleNamespace(declared=EHA))))
-    known = Provenance(trace=Source("est.csv", "1"), holdout=Source("holdout.csv", "2"), floor=FLOOR,
-                       ledger=(Row(None, ERROR, ERROR), Row("a", FLOOR, FLOOR)), history=("rig add a",), effects=("a",))
-    return ModelUpdate(Model(), known, ("a",), "", cast(Any, refit),
+    provenance = Provenance(trace=Source("est.csv", "1"), holdout=Source("holdout.csv", "2"), floor=FLOOR,
+                            ledger=(Row(None, ERROR, ERROR), Row("a", FLOOR, FLOOR)), history=("rig add a",),
+                            effects=("a",))
+    return ModelUpdate(Model(), provenance, ("a",), "", cast(Any, refit),
                        {"a.current": Value(1.5e-4, 1.4e-4, 1.6e-4, "A")}, (), ())
 
 
@@ -571,16 +572,16 @@ def test_a_comparison_shows_measured_minus_model() -> None:
     """Of a trace whose sensors of P12 and XS show too much, so that measured minus model is positive."""
     trace = record_plant(com=SHORT, seed=2)
     biased = trace.with_columns({name: trace.column(name) + size for name, size in OFFSETS.items()})
-    found = compare(biased, Model())
+    comparison = compare(biased, Model())
     panels = [[np.asarray(line.get_ydata()) for line in ax.lines if len(line.get_ydata()) > 2]  # those over time
-              for ax in vars(compare_report.draw_overview(found))["figure"].axes]
+              for ax in vars(compare_report.draw_overview(comparison))["figure"].axes]
     scales = {"xj": 1e6, "p12": 1e-5, "xs": 1e6}
     for number, (name, scale) in enumerate(scales.items()):
-        (measured, model), (residual,) = panels[1 + 2 * number:3 + 2 * number]  # after Com and XJ
+        (measurement, model), (residual,) = panels[1 + 2 * number:3 + 2 * number]  # after Com and XJ
         if name != "xj":  # drawn in mm, its residual in um
-            np.testing.assert_allclose(residual, measured - model, atol=1e-9)
+            np.testing.assert_allclose(residual, measurement - model, atol=1e-9)
             assert np.nanmean(residual) == pytest.approx(OFFSETS[name] * scale, rel=0.1)
-    captions = [item.caption for section in build_comparison_report(found).sections for item in section.items
+    captions = [item.caption for section in build_comparison_report(comparison).sections for item in section.items
                 if isinstance(item, Figure | Table) and "esidual" in item.caption]
     assert captions and all("measured minus model" in text for text in captions[:2])
 
@@ -616,13 +617,13 @@ def run_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     t = np.arange(3000) / 1000
     com = np.where(t < 0.5, 0.0, 5e-3)
     xj = np.where(t < 0.5, 0.0, 5e-3 * (1.0 - np.exp(-40 * (t - 0.5))))
-    failed = CheckResult(
+    check = CheckResult(
         name="settling time of the step", kind="settling_time", signal="xj", value=100.0, unit="ms", high=80.0,
         passed=False, t0=0.5, t1=1.5,
         detail="0 of 1000 samples missing, and a remark that is long enough to need several lines on a phone")
     trace = Trace.from_columns({"com": com, "xj": xj, "cor": 4.0 * (com - xj)}, 1e-3, {"node2.name": "x" * 200})
     path = tmp_path_factory.mktemp("run_page") / "report.html"
-    path.write_text(render_html(build_run_report(replace(trace, checks=(failed,) * 3))), encoding="utf-8")
+    path.write_text(render_html(build_run_report(replace(trace, checks=(check,) * 3))), encoding="utf-8")
     return path
 
 
@@ -657,7 +658,7 @@ def test_a_figure_is_zoomed_and_read(run_page: Path) -> None:
     assert "time=0.7500 s" in readouts["whole"].replace("0.750 s", "0.7500 s")
     assert readouts["zoomed"] != readouts["before"] == readouts["after"]
     assert {"0.540", "0.560"} <= set(readouts["zoomed"].split("|")) and "0.540" not in readouts["before"].split("|")
-    shown = dict(part.split("=") for part in readouts["read"].split("|"))
-    assert float(shown["time"].removesuffix(" s")) == pytest.approx(0.55, abs=0.001)
-    percent = float(shown["XJ less the target"].split()[0].replace("\u2212", "-"))
+    readout = dict(part.split("=") for part in readouts["read"].split("|"))
+    assert float(readout["time"].removesuffix(" s")) == pytest.approx(0.55, abs=0.001)
+    percent = float(readout["XJ less the target"].split()[0].replace("\u2212", "-"))
     assert percent == pytest.approx(-100 * np.exp(-40 * 0.05), abs=1.0)  # beyond the target, % of the step
