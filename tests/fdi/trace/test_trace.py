@@ -163,9 +163,9 @@ RAMP = np.concatenate([np.zeros(500), 0.33e-3 * TWO, np.full(500, 0.33e-3 * 2)])
     (np.concatenate([np.zeros(500), np.random.default_rng(0).normal(0, 1e-4, 1000)]), ["hold", "dynamic"]),
     *((1e-3 * np.sin(2 * np.pi * hz * TWO), ["dynamic"]) for hz in (0.1, 1.0, 30.0)), (PREFLIGHT, KINDS)])
 def test_sections_of_any_command(command: np.ndarray, kinds: list[str]) -> None:
-    found = find_sections(command)
-    assert [s.kind for s in found] == kinds or {s.kind for s in found} == {"dynamic"} == set(kinds)
-    assert [s.start for s in found] == [0, *[s.stop for s in found][:-1]] and found[-1].stop == len(command)
+    sections = find_sections(command)
+    assert [s.kind for s in sections] == kinds or {s.kind for s in sections} == {"dynamic"} == set(kinds)
+    assert [s.start for s in sections] == [0, *[s.stop for s in sections][:-1]] and sections[-1].stop == len(command)
 
 
 def test_sections_of_a_command_that_was_cut_off_anywhere() -> None:

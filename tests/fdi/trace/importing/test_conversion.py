@@ -34,9 +34,10 @@ XJ = 3e-3 * np.sin(2 * math.pi * 2.0 * T)
 def convert(tmp_path: Path, text: str, **columns: np.ndarray) -> Imported:
     """The import of columns com, xj, cor (sines unless given) and others."""
     (tmp_path / "x.bin").write_bytes(b"x")
-    known = {"com": XJ, "xj": XJ, "cor": XJ} | columns
-    channels = {name: Channel(np.asarray(values, float)) for name, values in known.items()}
-    measurement = Measurement(tmp_path / "x.bin", "arrays", dict.fromkeys(known, ""), read_singly(channels.__getitem__))
+    arrays = {"com": XJ, "xj": XJ, "cor": XJ} | columns
+    channels = {name: Channel(np.asarray(values, float)) for name, values in arrays.items()}
+    measurement = Measurement(
+        tmp_path / "x.bin", "arrays", dict.fromkeys(arrays, ""), read_singly(channels.__getitem__))
     return import_measurement(measurement, parse_map(text + MAP, tmp_path / "map.toml"), 1e-3)
 
 
@@ -59,8 +60,8 @@ P12 = '[time]\nrate = 1000\n[signals.p12]\nsource = "p"\n'
     ("sensor = {dead = [[0.2, 0.3]]}", {199: 199.0, 200: math.nan, 300: math.nan, 301: 301.0})])
 def test_scale_delay_and_dead_span(keys: str, rows: dict[int, float], tmp_path: Path) -> None:
     """Value = sign * (scale * raw + offset), some rows earlier, NaN where the channel was dead."""
-    got = convert(tmp_path, f"{P12}{keys}\n", p=np.arange(1000)).trace.p12
-    assert got[list(rows)].tolist() == pytest.approx(list(rows.values()), abs=0.0, nan_ok=True)
+    p12 = convert(tmp_path, f"{P12}{keys}\n", p=np.arange(1000)).trace.p12
+    assert p12[list(rows)].tolist() == pytest.approx(list(rows.values()), abs=0.0, nan_ok=True)
 
 
 @pytest.mark.parametrize(("text", "reason"), [
@@ -169,9 +170,9 @@ def test_damaged_files(name: str, word: str, tmp_path: Path) -> None:
 def test_the_map_in_the_manual_is_valid() -> None:
     text = (Path(__file__).parents[4] / "docs" / "import.md").read_text()
     block = text.split("shows every key:\n\n")[1].split("\n\n`[time]`")[0]
-    found = parse_map("\n".join(line[4:] for line in block.splitlines()), Path("import.md"))
-    assert found.signals["p12"].delay == 0.0035 and found.signals["p12"].sensor.moving_mean == 20.0
-    assert found.signals["xj"].make_dynamics("m").quantum == pytest.approx(2.5e-5)
+    import_map = parse_map("\n".join(line[4:] for line in block.splitlines()), Path("import.md"))
+    assert import_map.signals["p12"].delay == 0.0035 and import_map.signals["p12"].sensor.moving_mean == 20.0
+    assert import_map.signals["xj"].make_dynamics("m").quantum == pytest.approx(2.5e-5)
 
 
 @pytest.mark.parametrize(("text", "encoding"), [
@@ -249,15 +250,15 @@ def original(folder: Path) -> dict:
     return rig("compare", folder / "original.csv", "--json").json
 
 
-def require_same_answer(path: Path, expected: dict, tolerance: float) -> None:
-    found = rig("compare", path, "--json").json
-    assert found["verdict"] == expected["verdict"] == "MODEL_INCOMPLETE"
-    for name, signal in expected["signals"].items():
+def require_same_answer(path: Path, reference: dict, tolerance: float) -> None:
+    answer = rig("compare", path, "--json").json
+    assert answer["verdict"] == reference["verdict"] == "MODEL_INCOMPLETE"
+    for name, signal in reference["signals"].items():
         numbers = {key: signal[key] for key in ("error", "floor", "ratio", "closed_loop_error")}
-        assert {key: found["signals"][name][key] for key in numbers} == pytest.approx(numbers, rel=tolerance)
-    assert found["blocks"].pop("controller") < 2.0  # rounded by the bus
-    blocks = {name: ratio for name, ratio in expected["blocks"].items() if name != "controller"}
-    assert found["blocks"] == pytest.approx(blocks, rel=10 * tolerance)
+        assert {key: answer["signals"][name][key] for key in numbers} == pytest.approx(numbers, rel=tolerance)
+    assert answer["blocks"].pop("controller") < 2.0  # rounded by the bus
+    blocks = {name: ratio for name, ratio in reference["blocks"].items() if name != "controller"}
+    assert answer["blocks"] == pytest.approx(blocks, rel=10 * tolerance)
 
 
 def test_guess_then_import_of_a_german_csv(folder: Path, original: dict) -> None:
@@ -312,9 +313,9 @@ def test_blf_with_the_users_dbc(folder: Path, original: dict) -> None:
 def test_guess_of_a_can_log(folder: Path) -> None:
     answer = rig("import", "--guess", folder / "log.blf", "--dbc", folder / "user.dbc", "--out", folder / "blf.toml",
                "--json").json
-    found = {name: entry["source"] for name, entry in answer["signals"].items()}
-    assert found == {"time": "its own times", "com": "Demand.Target", "xj": "Ram.Stroke", "cor": "Valve.Current",
-                     "p12": "Ram.DeltaP", "xs": "Valve.Spool"}
+    sources = {name: entry["source"] for name, entry in answer["signals"].items()}
+    assert sources == {"time": "its own times", "com": "Demand.Target", "xj": "Ram.Stroke", "cor": "Valve.Current",
+                       "p12": "Ram.DeltaP", "xs": "Valve.Spool"}
 
 
 @pytest.mark.parametrize(("name", "package"), [("x.mf4", "asammdf"), ("x.parquet", "pyarrow")])
