@@ -68,19 +68,19 @@ def test_the_lines_of_the_page_find_the_hidden_effect(lines: dict[str, Any], run
 def test_there_are_six_short_examples_and_they_print_what_they_say(lines: dict[str, Any]) -> None:
     assert len(EXAMPLES) == len(re.findall(r"^\*\*\d\. ", PAGE, re.MULTILINE)) == 6
     assert all(len(example.strip().splitlines()) <= 7 for example in EXAMPLES)
-    compared, plotted, explained, diagnosed, simulated, table = lines["printed"]
-    assert compared.startswith("MODEL_INCOMPLETE") and "times the noise floor" in compared
-    assert plotted == simulated == ""
-    assert explained.splitlines() == ["EXPLAINED ('null_bias',)", "WITHIN_FLOOR"]
-    assert diagnosed.startswith("<DiagnosisResult ") and "'low'" in diagnosed
+    comparison, plot, explanation, diagnosis, simulation, table = lines["printed"]
+    assert comparison.startswith("MODEL_INCOMPLETE") and "times the noise floor" in comparison
+    assert plot == simulation == ""
+    assert explanation.splitlines() == ["EXPLAINED ('null_bias',)", "WITHIN_FLOOR"]
+    assert diagnosis.startswith("<DiagnosisResult ") and "'low'" in diagnosis
     assert [row.split()[:2] for row in table.splitlines()] == [
         ["nominal", "MODEL_INCOMPLETE"], ["fitted", "WITHIN_FLOOR"], ["clogged", "MODEL_INCOMPLETE"]]
 
 
 def test_a_plot_is_a_matplotlib_figure_and_files(lines: dict[str, Any], runs: dict[str, Path], tmp_path: Path) -> None:
     residual = lines["comparison"].plot().figure.axes[2]
-    drawn = max(len(line.get_xdata()) for line in residual.lines)
-    assert residual.get_ylabel() == "residual of\nXJ [um]" and drawn == len(lines["trace"]), "all points"
+    point_count = max(len(line.get_xdata()) for line in residual.lines)
+    assert residual.get_ylabel() == "residual of\nXJ [um]" and point_count == len(lines["trace"]), "all points"
     assert (runs["est"].parent / "close_up.png").read_bytes().startswith(b"\x89PNG")
     shares = lines["comparison"].plot("Where")  # a small one
     for name, begin in (("a.svg", b"<svg"), ("a.png", b"\x89PNG"), ("a.pdf", b"%PDF")):
@@ -93,17 +93,17 @@ def test_a_plot_is_a_matplotlib_figure_and_files(lines: dict[str, Any], runs: di
 
 def test_a_plot_converts_to_plotly(lines: dict[str, Any], tmp_path: Path) -> None:
     pytest.importorskip("plotly")
-    plots, compared = lines["comparison"], lines["comparison"].comparison
-    found = plots.plot().to_plotly()
-    residual, floor = 1e6 * compared.replay.residual["xj"], 2e6 * compared.signals["xj"].floor.value
-    curves = [curve for curve in found.data if curve.yaxis == "y3"]
+    plots, comparison = lines["comparison"], lines["comparison"].comparison
+    figure = plots.plot().to_plotly()
+    residual, floor = 1e6 * comparison.replay.residual["xj"], 2e6 * comparison.signals["xj"].floor.value
+    curves = [curve for curve in figure.data if curve.yaxis == "y3"]
     assert any(len(curve.y) == len(residual) and np.allclose(curve.y, residual, equal_nan=True) for curve in curves)
     assert any(curve.fill == "toself" and max(curve.y) == pytest.approx(floor) for curve in curves), "the noise floor"
-    assert found.layout.xaxis3.matches == "x" and found.layout.yaxis3.title.text == "residual of<br>XJ [um]"
-    assert {curve.name for curve in found.data if curve.showlegend} >= {"measured", "model, from the current"}
+    assert figure.layout.xaxis3.matches == "x" and figure.layout.yaxis3.title.text == "residual of<br>XJ [um]"
+    assert {curve.name for curve in figure.data if curve.showlegend} >= {"measured", "model, from the current"}
     plots.plot("Where").write(tmp_path / "where.html")
     assert "Plotly.newPlot" in (tmp_path / "where.html").read_text()
-    assert len(plots.plot("Where").to_plotly().layout.yaxis.ticktext) == len(compared.where)
+    assert len(plots.plot("Where").to_plotly().layout.yaxis.ticktext) == len(comparison.where)
 
 
 def test_without_plotly_the_message_says_what_to_install(
@@ -126,11 +126,11 @@ def test_values_have_a_short_repr(name: str, begin: str, lines: dict[str, Any]) 
 def test_every_result_prints_shows_plots_and_converts(name: str, lines: dict[str, Any]) -> None:
     result: Any = lines[name]
     assert isinstance(result, Result) and str(result).startswith(f"{result.verdict}  {result.sentence}\n")
-    page, cell, told, drawn = result.to_html(), result._repr_html_(), result.to_dict(), result.plot()
+    page, cell, document, plot = result.to_html(), result._repr_html_(), result.to_dict(), result.plot()
     assert result.verdict in page and "</html>" in page
     assert cell.startswith("<iframe srcdoc=") and "<script" not in cell
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
-    assert isinstance(drawn, Plot) and drawn.startswith("<svg") and drawn.caption in page
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert isinstance(plot, Plot) and plot.startswith("<svg") and plot.caption in page
     assert f"one of {result.figures[0]}" in catch_refusal(result.plot, "nothing of this name")
 
 
@@ -143,8 +143,8 @@ def test_the_dictionary_is_the_answer_of_the_command(lines: dict[str, Any], runs
 def test_a_model_is_a_value_a_file_or_a_name(runs: dict[str, Path], tmp_path: Path) -> None:
     model = Model().replace(HIDDEN)
     (tmp_path / "biased.toml").write_text(model.to_toml())
-    found = [fdi.compare(runs["est"], given).verdict for given in (model, tmp_path / "biased.toml", "eha")]
-    assert found == ["WITHIN_FLOOR", "WITHIN_FLOOR", "MODEL_INCOMPLETE"]
+    verdicts = [fdi.compare(runs["est"], source).verdict for source in (model, tmp_path / "biased.toml", "eha")]
+    assert verdicts == ["WITHIN_FLOOR", "WITHIN_FLOOR", "MODEL_INCOMPLETE"]
 
 
 @pytest.mark.parametrize(("call", "says"), [
@@ -167,8 +167,8 @@ def test_importing_fdi_loads_neither_numba_nor_matplotlib() -> None:
 
 def test_the_bar_of_a_diagnosis_moves_within_its_long_stage() -> None:
     run = simulate_trace(Model().replace({"filter.clogging": 0.2}), build_command(), seed=1, steps=50)
-    seen: list[tuple[str, float]] = []
-    diagnose(run, workers=1, progress=lambda name, share: seen.append((name, share)))
-    shares = [share for _, share in seen]
+    stages: list[tuple[str, float]] = []
+    diagnose(run, workers=1, progress=lambda name, share: stages.append((name, share)))
+    shares = [share for _, share in stages]
     assert shares == sorted(shares) and shares[-1] == 1.0
-    assert len({share for name, share in seen if name == "refinement"}) > 8
+    assert len({share for name, share in stages if name == "refinement"}) > 8
