@@ -57,19 +57,19 @@ def play_shown(folder: Path) -> Iterator[Row]:
         shutil.copytree(ROOT / "docs", clone / "docs")
     shutil.copy(ROOT / "rig/sequences/preflight.toml", clone / "my_test.toml")
     for page in ("README.md", "docs/tutorial.md"):
-        for played in shown_commands.play_page((ROOT / page).read_text(), clone, make_environment()):
-            status = "-" if played.status is None else str(played.status)
-            result = "; ".join(played.faults) or ("not run" if played.line in shown_commands.DONE_BY_CI else "ok")
-            yield f"{page}: `{played.line}`", status, f"{played.seconds:.1f} s", result
+        for outcome in shown_commands.play_page((ROOT / page).read_text(), clone, make_environment()):
+            status = "-" if outcome.status is None else str(outcome.status)
+            result = "; ".join(outcome.faults) or ("not run" if outcome.line in shown_commands.DONE_BY_CI else "ok")
+            yield f"{page}: `{outcome.line}`", status, f"{outcome.seconds:.1f} s", result
 
 
 def play_pages(folder: Path) -> Iterator[Row]:
     """The lines of the other pages, each section in a folder with the files that it needs."""
     for part in shown_commands.PARTS:
-        for played in shown_commands.play_part(part, folder, make_environment()):
-            status = "-" if played.status is None else str(played.status)
-            result = "; ".join(played.faults) or ("ok" if played.status is not None else "not run")
-            yield f"{part.page}: `{played.line}`", status, f"{played.seconds:.1f} s", result
+        for outcome in shown_commands.play_part(part, folder, make_environment()):
+            status = "-" if outcome.status is None else str(outcome.status)
+            result = "; ".join(outcome.faults) or ("ok" if outcome.status is not None else "not run")
+            yield f"{part.page}: `{outcome.line}`", status, f"{outcome.seconds:.1f} s", result
 
 
 PARTS: dict[str, Callable[[Path], Iterator[Row]]] = {"shown": play_shown, "pages": play_pages}

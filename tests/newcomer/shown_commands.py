@@ -53,12 +53,12 @@ def list_steps(page: str) -> list[Step]:
                 steps.append(_make_file(code))
                 code = []
             if re.match(r"(rig|make|mkdir|cp|cd) ", line):
-                typed, *remarks = re.split(r"\s{2,}#", line, maxsplit=1)
-                steps.append(Step("line", typed.strip()))
-                for promised in filter(None, (VERDICT.match(remark.strip()) for remark in remarks)):
-                    steps.append(Step("answer", promised[1]))
-            elif found := VERDICT.match(line):
-                steps.append(Step("answer", found[1]))
+                command, *remarks = re.split(r"\s{2,}#", line, maxsplit=1)
+                steps.append(Step("line", command.strip()))
+                for match in filter(None, (VERDICT.match(remark.strip()) for remark in remarks)):
+                    steps.append(Step("answer", match[1]))
+            elif verdict := VERDICT.match(line):
+                steps.append(Step("answer", verdict[1]))
         if code:
             steps.append(_make_file(code))
     return steps
@@ -84,10 +84,10 @@ def play_page(page: str, folder: Path, environment: Mapping[str, str], not_playe
             is_played = False
             yield Played(step.text, None, 0.0, ())
         else:
-            played, folder, output = play_line(step.text, folder, environment)
+            outcome, folder, output = play_line(step.text, folder, environment)
             printed |= {*VERDICT.findall(output)}
             is_played = True
-            yield played
+            yield outcome
 
 
 def play_line(line: str, folder: Path, environment: Mapping[str, str], timeout: float = 900.0
@@ -106,8 +106,8 @@ def play_line(line: str, folder: Path, environment: Mapping[str, str], timeout: 
 
 def judge_line(line: str, status: int, err: str) -> list[str]:
     """What is wrong with the end of a line; empty if nothing is."""
-    expected = (2,) if NEEDS_HARDWARE in line else (0, 1)
-    faults = [] if status in expected else [f"status {status}: {err.strip()[-200:]}"]
+    good_statuses = (2,) if NEEDS_HARDWARE in line else (0, 1)
+    faults = [] if status in good_statuses else [f"status {status}: {err.strip()[-200:]}"]
     if "Traceback" in err:
         faults.append("a traceback")
     if status == 2 and len(err.strip().splitlines()) != 1:
@@ -212,8 +212,8 @@ def find_section(page: str, title: str) -> str:
 
 def list_command_lines(text: str) -> list[str]:
     """The lines of a text that a reader types, without the remark behind them."""
-    found = re.findall(r"^    ((?:rig|python|pytest) (?!=).*)", text, re.MULTILINE)
-    return [re.split(r"\s{2,}#", line)[0].strip() for line in found]
+    return [re.split(r"\s{2,}#", line)[0].strip()
+            for line in re.findall(r"^    ((?:rig|python|pytest) (?!=).*)", text, re.MULTILINE)]
 
 
 def play_part(part: Part, folder: Path, environment: Mapping[str, str]) -> Iterator[Played]:

@@ -24,12 +24,12 @@ from rig.cli.command_list import COMMANDS
 def test_bad_input_gets_one_line_that_names_it(here: Path) -> None:
     write_bad_files(here)
     before = {path: path.read_bytes() for path in here.rglob("*") if path.is_file()}
-    found = {}
+    case_faults = {}
     for case in BAD_INPUTS:
         result = rig(*case.words.split())
         CATALOGUE.pop("slip", None)  # of one of them
-        found[case.words] = find_faults(case, result.status, result.out, result.err)
-    assert {words: faults for words, faults in found.items() if faults} == {}
+        case_faults[case.words] = find_faults(case, result.status, result.out, result.err)
+    assert {words: faults for words, faults in case_faults.items() if faults} == {}
     assert {path: path.read_bytes() for path in here.rglob("*") if path.is_file()} == before
 
 
@@ -49,14 +49,14 @@ def test_ctrl_c_ends_a_search_and_leaves_nothing(tmp_path: Path) -> None:
 
 def test_every_command_line_of_a_page_is_played_or_has_a_reason() -> None:
     """And a reason belongs to a line that stands on a page."""
-    played = {page: "".join(find_section(page, part.section) for part in PARTS if part.page == page)
-              for page in {part.page for part in PARTS}}
+    played_text = {page: "".join(find_section(page, part.section) for part in PARTS if part.page == page)
+                   for page in {part.page for part in PARTS}}
     pages = [f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")) if path.name != "tutorial.md"]
-    shown = {page: list_command_lines((ROOT / page).read_text()) for page in pages}
-    skipped = {page: [line for where, title in NOT_PLAYED_SECTIONS if where == page
-                      for line in list_command_lines(find_section(page, title))] for page in pages}
-    missing = [f"{page}: {line}" for page, lines in shown.items() if page not in NOT_PLAYED_PAGES for line in lines
-               if line not in [*list_command_lines(played.get(page, "")), *skipped[page]]]
+    page_lines = {page: list_command_lines((ROOT / page).read_text()) for page in pages}
+    skipped_lines = {page: [line for where, title in NOT_PLAYED_SECTIONS if where == page
+                            for line in list_command_lines(find_section(page, title))] for page in pages}
+    missing = [f"{page}: {line}" for page, lines in page_lines.items() if page not in NOT_PLAYED_PAGES for line in lines
+               if line not in [*list_command_lines(played_text.get(page, "")), *skipped_lines[page]]]
     assert missing == []
-    assert {*NOT_PLAYED_PAGES} <= {page for page, lines in shown.items() if lines} - {*played}
-    assert {*NOT_PLAYED} <= {line for page in played for line in shown[page]}
+    assert {*NOT_PLAYED_PAGES} <= {page for page, lines in page_lines.items() if lines} - {*played_text}
+    assert {*NOT_PLAYED} <= {line for page in played_text for line in page_lines[page]}
