@@ -165,16 +165,16 @@ def folder(module: str) -> str:
 def test_folders_import_only_lower_ones() -> None:
     """What a folder may import stands in ARCHITECTURE.md."""
     for path in MODULES:
-        own = folder(name(path).removesuffix(".py").replace("/", "."))
-        package = own.partition(".")[0]
-        if package not in ("fdi", "rig") or own.endswith(".__init__"):
+        importer = folder(name(path).removesuffix(".py").replace("/", "."))
+        package = importer.partition(".")[0]
+        if package not in ("fdi", "rig") or importer.endswith(".__init__"):
             continue  # a package's face hands on what its folders have
-        assert own in FOLDERS or own in SINGLE_MAY_IMPORT, f"{own} has no place in the order of folders"
-        if own == "rig.cli":
+        assert importer in FOLDERS or importer in SINGLE_MAY_IMPORT, f"{importer} has no place in the order of folders"
+        if importer == "rig.cli":
             continue
-        others = {folder(module) for module in imported(path) if module.startswith(f"{package}.")} - {own}
-        allowed = FOLDERS[own].may_import if own in FOLDERS else SINGLE_MAY_IMPORT[own]
-        assert others <= allowed | (SHARED if package == "fdi" and own not in SHARED else set()), name(path)
+        imports = {folder(module) for module in imported(path) if module.startswith(f"{package}.")} - {importer}
+        lower_folders = FOLDERS[importer].may_import if importer in FOLDERS else SINGLE_MAY_IMPORT[importer]
+        assert imports <= lower_folders | (SHARED if package == "fdi" and importer not in SHARED else set()), name(path)
 
 
 def count_statements(path: Path) -> int:
@@ -186,31 +186,31 @@ def count_statements(path: Path) -> int:
 
 def test_each_folder_keeps_its_budget() -> None:
     """The whole is as large as one person can hold: a folder that grows past its budget makes another part smaller."""
-    counted = {folder.path: sum(map(count_statements, (ROOT / folder.path).rglob("*.py")))
-               for folder in FOLDERS.values()}
-    assert len(counted) > 20 and all(counted.values())
-    assert {path: count for path, count in counted.items() if count > FOLDERS[path.replace("/", ".")].most} == {}
+    counts = {folder.path: sum(map(count_statements, (ROOT / folder.path).rglob("*.py")))
+              for folder in FOLDERS.values()}
+    assert len(counts) > 20 and all(counts.values())
+    assert {path: count for path, count in counts.items() if count > FOLDERS[path.replace("/", ".")].most} == {}
 
 
 def test_private_names_stay_in_their_module() -> None:
     """What another module needs is public there, and has a docstring."""
     for path in MODULES:
-        found = [alias.name for node in nodes(path) if isinstance(node, ast.ImportFrom) for alias in node.names
-                 if alias.name.startswith("_")]
-        assert found == [], name(path)
+        private_names = [alias.name for node in nodes(path) if isinstance(node, ast.ImportFrom) for alias in node.names
+                         if alias.name.startswith("_")]
+        assert private_names == [], name(path)
 
 
 def test_imports_stay_in_their_place() -> None:
     """numba in one file, no CAN outside rig, no wall clock but at the edge."""
     for path in MODULES:
         for module in {module.partition(".")[0] for module in imported(path)}:
-            allowed = CLOCK_FILES if module in CLOCK_MODULES else ONLY_IN.get(module, ("",))
-            assert name(path).startswith(allowed or "nowhere"), f"{name(path)} imports {module}"
+            places = CLOCK_FILES if module in CLOCK_MODULES else ONLY_IN.get(module, ("",))
+            assert name(path).startswith(places or "nowhere"), f"{name(path)} imports {module}"
 
 
 def test_public_names() -> None:
     """The packages offer exactly these names; a change of them is a decision, made here."""
-    found = {}
+    public_names = {}
     for path in MODULES:
         if path.name == "__init__.py":
             module = importlib.import_module(name(path.parent).replace("/", "."))
@@ -218,8 +218,8 @@ def test_public_names() -> None:
             defines = any(isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Assign) for node in tree(path).body)
             assert names or not defines or path.with_suffix(".pyi").exists(), f"{name(path)} has no __all__"
             assert [word for word in names if not hasattr(module, word)] == [], name(path)
-            found |= {module.__name__: names} if names else {}
-    assert found == PUBLIC
+            public_names |= {module.__name__: names} if names else {}
+    assert public_names == PUBLIC
 
 
 def test_one_address_for_each_name() -> None:
@@ -228,11 +228,12 @@ def test_one_address_for_each_name() -> None:
                if isinstance(node, ast.ImportFrom) for alias in node.names}
     for stub in [path for path in tracked() if path.name == "__init__.pyi" and path.parent.name != "fdi"]:
         folder = name(stub.parent).replace("/", ".")
-        offered = {(f"{folder}.{node.module}", alias.name) for node in nodes(stub) if isinstance(node, ast.ImportFrom)
-                   for alias in node.names}
-        assert [found for found in imports if found[:2] in offered and stub.parent not in found[2].parents] == []
-        used = {word for module, word, path in imports if module == folder and path.parts[len(ROOT.parts)] != "tests"}
-        assert {word for _, word in offered} - used == set(), folder
+        stub_names = {(f"{folder}.{node.module}", alias.name) for node in nodes(stub)
+                      if isinstance(node, ast.ImportFrom) for alias in node.names}
+        assert [each for each in imports if each[:2] in stub_names and stub.parent not in each[2].parents] == []
+        used_names = {word for module, word, path in imports
+                      if module == folder and path.parts[len(ROOT.parts)] != "tests"}
+        assert {word for _, word in stub_names} - used_names == set(), folder
 
 
 def test_no_leftovers_and_no_machine_paths() -> None:
@@ -240,12 +241,12 @@ def test_no_leftovers_and_no_machine_paths() -> None:
     notes = "|".join(["TO" + "DO", "FIX" + "ME", "X" * 3, "HA" + "CK"])
     hosts = "|".join(["pypi" + r"\.org", "pythonhosted" + r"\.org", "debian" + r"\.org", "npm" + r"js\."])
     bad = re.compile(rf"\b(?:{notes})\b|(?:{hosts})|(?<![\w.$}}~*-])/(?:work|root|home|tmp)/\w")
-    found = []
+    leftovers = []
     for path in tracked():
         for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
             if bad.search(line):
-                found.append(f"{name(path)}:{number}: {line.strip()[:100]}")
-    assert found == []
+                leftovers.append(f"{name(path)}:{number}: {line.strip()[:100]}")
+    assert leftovers == []
 
 
 def test_each_threshold_has_its_reason() -> None:
@@ -272,9 +273,9 @@ def test_pins_have_both_bounds() -> None:
 def test_each_dependency_is_explained() -> None:
     """ARCHITECTURE.md has a line '- `name`: why (licence)' for each dependency, and for nothing else."""
     text = (ROOT / "ARCHITECTURE.md").read_text()
-    named = {re.split("[<>=]", line)[0] for line in requirements()}
-    explained = set(re.findall(r"^\s*[-*] `([a-z0-9-]+)`: .+\(.+\)", text, re.MULTILINE))
-    assert explained == named
+    dependencies = {re.split("[<>=]", line)[0] for line in requirements()}
+    explained_names = set(re.findall(r"^\s*[-*] `([a-z0-9-]+)`: .+\(.+\)", text, re.MULTILINE))
+    assert explained_names == dependencies
 
 
 def test_each_import_is_declared() -> None:
@@ -282,23 +283,23 @@ def test_each_import_is_declared() -> None:
     distributions = {"can": "python-can", "mcap_protobuf": "mcap-protobuf-support", "google": "protobuf",
                      "rerun": "rerun-sdk", "llvmlite": "numba", "sklearn": "scikit-learn",
                      "lazy_loader": "lazy-loader"}  # numba pins llvmlite itself
-    named = {re.split("[<>=]", line)[0] for line in requirements()}
+    dependencies = {re.split("[<>=]", line)[0] for line in requirements()}
     for path in MODULES:
         if name(path).startswith("studies/"):
             continue  # a study says itself what it compares with
         for module in {module.partition(".")[0] for module in imported(path)}:
-            known = module in sys.stdlib_module_names or module in PACKAGES
-            assert known or distributions.get(module, module) in named, f"{name(path)} imports {module}"
+            is_exempt = module in sys.stdlib_module_names or module in PACKAGES
+            assert is_exempt or distributions.get(module, module) in dependencies, f"{name(path)} imports {module}"
 
 
 def test_each_dependency_is_used() -> None:
     """Nothing is installed for nothing."""
     modules = {"python-can": "can", "mcap-protobuf-support": "mcap_protobuf", "protobuf": "google",
                "lazy-loader": "lazy_loader"}
-    used = {module.partition(".")[0] for path in MODULES for module in imported(path)}
+    imports = {module.partition(".")[0] for path in MODULES for module in imported(path)}
     for line in PROJECT["project"]["dependencies"]:
         distribution = re.split("[<>=]", line)[0]
-        assert modules.get(distribution, distribution) in used, distribution
+        assert modules.get(distribution, distribution) in imports, distribution
 
 
 def test_every_package_and_data_file_is_installed() -> None:
@@ -349,13 +350,13 @@ def list_known_names() -> set[str]:
 def find_unknown_names(source: str) -> list[str]:
     """Names in backticks in the docstrings and comments of a file that nothing defines or uses."""
     text, words = split_source(source)
-    known = list_known_names() | words
-    return [name for name in NAME.findall(text) if not set(filter(None, name.split("."))) <= known]
+    known_names = list_known_names() | words
+    return [name for name in NAME.findall(text) if not set(filter(None, name.split("."))) <= known_names]
 
 
 def test_names_in_backticks_exist() -> None:
-    found = {path.relative_to(ROOT).as_posix(): find_unknown_names(path.read_text()) for path in FILES}
-    assert len(found) > 200 and {path: names for path, names in found.items() if names} == {}
+    unknown_names = {path.relative_to(ROOT).as_posix(): find_unknown_names(path.read_text()) for path in FILES}
+    assert len(unknown_names) > 200 and {path: names for path, names in unknown_names.items() if names} == {}
 
 
 def test_examples_in_docstrings_are_true() -> None:

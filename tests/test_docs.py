@@ -45,8 +45,8 @@ SEQUENCES = (ROOT / "docs" / "sequences.md").read_text()
 
 def indented_blocks(text: str) -> list[str]:
     """The indented blocks of a Markdown text, without their indentation."""
-    found = re.findall(r"(?:^    .*\n(?:\s*\n(?=    ))?)+", text, re.MULTILINE)
-    return [re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in found]
+    return [re.sub(r"^    ", "", block, flags=re.MULTILINE)
+            for block in re.findall(r"(?:^    .*\n(?:\s*\n(?=    ))?)+", text, re.MULTILINE)]
 
 
 def documented_keys() -> Iterator[tuple[str, str]]:
@@ -165,14 +165,14 @@ SYMBOLS = re.findall(r"^\|\s*(\S*?)\s*\| `([a-z_]+\.[a-z_]+)`[^|]*\| ([^|]+) \|"
 
 
 def test_the_table_of_symbols_has_every_parameter_and_its_symbol() -> None:
-    known = {name: list_quantities(GROUPS[name.split(".")[0]])[name.split(".")[1]].symbol
-             for name in Model().list_names()}
-    assert {name: symbol for symbol, name, _ in SYMBOLS} == known
+    symbols = {name: list_quantities(GROUPS[name.split(".")[0]])[name.split(".")[1]].symbol
+               for name in Model().list_names()}
+    assert {name: symbol for symbol, name, _ in SYMBOLS} == symbols
 
 
 def test_the_table_of_symbols_has_the_nominal_values() -> None:
-    shown = {name: float(value) for _, name, value in SYMBOLS if name != "filter.law"}
-    assert shown == pytest.approx({name: Model()[name] for name in shown}, rel=2e-3)
+    values = {name: float(value) for _, name, value in SYMBOLS if name != "filter.law"}
+    assert values == pytest.approx({name: Model()[name] for name in values}, rel=2e-3)
 
 
 def test_the_glossary_has_every_verdict() -> None:
@@ -253,10 +253,10 @@ def cells() -> list[RunCell]:
 
 
 def test_every_page_is_in_the_navigation(reference: Path) -> None:
-    known = SITE_PAGES | MADE | {path.relative_to(reference.parent).as_posix() for path in reference.rglob("*.md")}
-    assert compare_navigation(known) == []
-    assert compare_navigation(known | {"docs/new.md"}) == ["docs/new.md: not in docs/site/navigation.toml"]
-    assert compare_navigation(known - {"docs/bus.md"}) == [
+    pages = SITE_PAGES | MADE | {path.relative_to(reference.parent).as_posix() for path in reference.rglob("*.md")}
+    assert compare_navigation(pages) == []
+    assert compare_navigation(pages | {"docs/new.md"}) == ["docs/new.md: not in docs/site/navigation.toml"]
+    assert compare_navigation(pages - {"docs/bus.md"}) == [
         "docs/bus.md: in docs/site/navigation.toml, but there is no such page"]
     assert [part["title"] for part in NAVIGATION] == ["Tutorial", "How-to", "Reference", "Explanation"]
 
@@ -298,8 +298,8 @@ def test_the_site_is_whole_and_needs_no_network(cells: list[RunCell], tmp_path: 
                                        *(page for part in NAVIGATION for page in part["pages"])}
     index = (site / "searchindex.js").read_text()
     assert '"stribeck"' in index and "Search.setIndex(" in index
-    shown = (site / "docs" / f"{NOTEBOOK.stem}.html").read_text()
-    assert shown.count('.svg"') == 2 and "truth 50 uA" in shown
+    notebook_page = (site / "docs" / f"{NOTEBOOK.stem}.html").read_text()
+    assert notebook_page.count('.svg"') == 2 and "truth 50 uA" in notebook_page
 
 
 def test_what_is_wrong_with_a_site_is_found(tmp_path: Path) -> None:
@@ -321,7 +321,7 @@ def test_the_notebook_finds_the_effect_and_the_error_falls(cells: list[RunCell])
     assert "EXPLAINED null_bias explains the residual" in message
     ratios = [float(value) for value in re.findall(r"([\d.]+) times the noise floor", message)]
     assert len(ratios) == 2 and ratios[0] > 20.0 and 0.8 < ratios[1] < 1.2
-    ((value, low, high),) = (map(float, found) for found in
+    ((value, low, high),) = (map(float, groups) for groups in
                              re.findall(r"null bias ([\d.]+) uA \(([\d.]+) \.\. ([\d.]+)\)", message))
     assert low < 50.0 < high and abs(value - 50.0) < 1.0
     assert sum(str(cell.value).startswith("<svg") for cell in cells) == 2
@@ -360,10 +360,10 @@ def test_a_schema_is_valid_named_in_the_page_and_refers_to_what_is_there(name: s
     assert f"schema/{name}" in PAGE
     for reference in re.findall(r'"\$ref": "([^"]+)"', json.dumps(SCHEMAS[name])):
         file, _, place = reference.partition("#")
-        found: Any = SCHEMAS[file or name]
+        schema: Any = SCHEMAS[file or name]
         for key in place.strip("/").split("/") if place else []:
-            found = found[key]
-        assert found["type"], reference
+            schema = schema[key]
+        assert schema["type"], reference
 
 
 def test_every_command_that_answers_in_json_has_a_schema() -> None:
@@ -425,19 +425,19 @@ def test_the_answers_of_runs(preflight: Path, aborted: Path) -> None:
 
 def test_the_answers_of_small_commands(preflight: Path, here: Path) -> None:
     Path("command.csv").write_text("t,com\n0,0\n0.001,1e-3\n0.002,1e-3\n")
-    simulated = rig("simulate", "--command", "command.csv", "--out", "short.csv", "--json").json
+    simulation = rig("simulate", "--command", "command.csv", "--out", "short.csv", "--json").json
     samples = rig("simulate", "--samples", "--json").json
     traces = [Path(name) for name in ("run.csv", "run2.csv", "held.csv")]
     assert samples["traces"] == [*map(str, traces)] and all(trace.exists() for trace in traces)
-    assert_all_seen("simulate", simulated, samples)
+    assert_all_seen("simulate", simulation, samples)
     kinds = ("parameters", "signals", "sequences", "effects", "checks", "models", "benches", "plants", "faults")
     assert_all_seen("list", *(rig("list", kind, "--json").json for kind in kinds))
     assert_all_seen("report", rig("report", preflight, "--out", "page.html", "--json").json)
     assert_all_seen("export", rig("export", preflight, "--out", "run.csv", "--force", "--json").json,
                     rig("export", "--fmu", "eha.fmu", "--json").json)
     assert_all_seen("recover", rig("recover", preflight / "trace.mcap", "--out", "again.mcap", "--json").json)
-    imported = rig("import", "run.csv", "--out", "run.mcap", "--json").json
-    check_answer(["import"], imported)
+    import_answer = rig("import", "run.csv", "--out", "run.mcap", "--json").json
+    check_answer(["import"], import_answer)
     check_answer(["check"], rig("check", "preflight", "--json").json)
     assert_all_seen("diff", rig("diff", preflight, "run.csv", "--json").json)
     assert_all_seen("doctor", rig("doctor", "--json").json)

@@ -107,14 +107,14 @@ def test_flags_of_a_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     info.write_text("processor\t: 0\nflags\t\t: fpu sse2 avx\n\nprocessor\t: 1\nflags\t\t: fpu avx2 fma\n")
     assert {"fpu", "avx"} <= blas.read_cpu_flags(info) and "avx2" not in blas.read_cpu_flags(info)
     assert blas.read_cpu_flags(tmp_path / "missing") == set()
-    for flags, mine, expected in ((set(), None, None), ({"avx2", "fma"}, None, "Haswell"),
-                                  ({"avx2", "fma"}, "Zen", "Zen")):
+    for flags, user_core_type, core_type in ((set(), None, None), ({"avx2", "fma"}, None, "Haswell"),
+                                             ({"avx2", "fma"}, "Zen", "Zen")):
         monkeypatch.setattr(blas, "read_cpu_flags", lambda flags=flags: flags)
         monkeypatch.delenv("OPENBLAS_CORETYPE", raising=False)
-        if mine:
-            monkeypatch.setenv("OPENBLAS_CORETYPE", mine)
+        if user_core_type:
+            monkeypatch.setenv("OPENBLAS_CORETYPE", user_core_type)
         blas.fix_blas_kernels()
-        assert os.environ.get("OPENBLAS_CORETYPE") == expected
+        assert os.environ.get("OPENBLAS_CORETYPE") == core_type
 
 
 FRACTION = 0.01  # of the width of the interval
