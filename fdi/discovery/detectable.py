@@ -115,9 +115,9 @@ class SimulatedRun(Problem):
 
     run: Floats = field(default_factory=lambda: np.empty(0))
 
-    def subtract_measurements(self, predicted: Floats) -> Floats:
+    def subtract_measurements(self, predictions: Floats) -> Floats:
         """What predictions (m, s, n) leave of the simulated run: (m, s, n)."""
-        return super().subtract_measurements(predicted - self.run + self.trace.measurements)
+        return super().subtract_measurements(predictions - self.run + self.trace.measurements)
 
 
 class VirtualTest:

@@ -11,7 +11,7 @@ import pytest
 from broken_devices import list_cases
 from bus_stations import spec
 from c_device import needs_compiler
-from example_devices import DRIVE, ECU, PATIENT, DriveDesk, EcuDesk, make_drive, run_device
+from example_devices import DRIVE, ECU, PATIENT, DriveHarness, EcuHarness, make_drive, run_device
 from node_bench import MS
 from rig_command import SHORT, SLOW_START, CommandResult, rig, write_file
 
@@ -27,11 +27,11 @@ STOPPED, REACTION, FAULT = "QUICK STOP ACTIVE", "FAULT REACTION ACTIVE", "FAULT"
 
 
 @pytest.fixture
-def drive() -> DriveDesk:
+def drive() -> DriveHarness:
     """A drive that is OPERATIONAL in mode 8, and its master."""
-    desk = DriveDesk()
-    desk.start()
-    return desk
+    harness = DriveHarness()
+    harness.start()
+    return harness
 
 
 @pytest.mark.parametrize(("controls", "states"), [
@@ -49,7 +49,7 @@ def drive() -> DriveDesk:
     ([SHUTDOWN, ENABLE, QUICK_STOP, QUICK_STOP], [READY, ENABLED, STOPPED, DISABLED]),  # 11, 12
     ([SHUTDOWN, ENABLE, RESET], [READY, ENABLED, ENABLED]),  # no fault to reset
 ])
-def test_each_transition(drive: DriveDesk, controls: list[int], states: list[str]) -> None:
+def test_each_transition(drive: DriveHarness, controls: list[int], states: list[str]) -> None:
     """Control words from SWITCH ON DISABLED on, and the states that they lead to."""
     assert drive.cycle(OFF).state == DISABLED
     assert [drive.cycle(control).state for control in controls] == states
@@ -62,13 +62,13 @@ def test_each_transition(drive: DriveDesk, controls: list[int], states: list[str
     (100_000, 0.0, 400),
     (-2_147_483_648, 1e30, -400),
 ])
-def test_current_follows_the_error_up_to_its_limit(drive: DriveDesk, target: int, position: float, current: int
+def test_current_follows_the_error_up_to_its_limit(drive: DriveHarness, target: int, position: float, current: int
                                                    ) -> None:
     answer = drive.enable(target, position)
     assert (answer.current, bool(answer.status & 0x800)) == (current, abs(current) == 400)
 
 
-def test_what_it_does_not_know_is_refused(drive: DriveDesk) -> None:
+def test_what_it_does_not_know_is_refused(drive: DriveHarness) -> None:
     modes, code, gain = drive.sdo[0x6060], drive.sdo[0x605A], drive.sdo[0x2002][1]
     writes = [*((modes, mode) for mode in (-1, 1, 3, 6, 7, 9)), (code, 3), (code, 5), (gain, float("nan")),
               (gain, -1.0)]
@@ -80,7 +80,7 @@ def test_what_it_does_not_know_is_refused(drive: DriveDesk) -> None:
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_a_missing_rpdo_is_a_fault(drive: DriveDesk, number: int) -> None:
+def test_a_missing_rpdo_is_a_fault(drive: DriveHarness, number: int) -> None:
     drive.enable(target=1000)
     answers = [drive.cycle(silent=(number,)) for _ in range(5)]
     assert [answer.state for answer in answers] == [ENABLED, ENABLED, ENABLED, REACTION, FAULT]
@@ -96,7 +96,7 @@ def test_a_missing_rpdo_is_a_fault(drive: DriveDesk, number: int) -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_position_that_is_no_number_is_a_fault(drive: DriveDesk, value: float) -> None:
+def test_a_position_that_is_no_number_is_a_fault(drive: DriveHarness, value: float) -> None:
     drive.enable(target=1000)
     assert drive.cycle(position=value)[:2] == (REACTION, 0)
     assert drive.last_emergency()[0] == 0x7300
@@ -104,7 +104,7 @@ def test_a_position_that_is_no_number_is_a_fault(drive: DriveDesk, value: float)
     assert [drive.cycle(control).state for control in (OFF, RESET)] == [FAULT, DISABLED]
 
 
-def test_lost_sync_is_a_fault(drive: DriveDesk) -> None:
+def test_lost_sync_is_a_fault(drive: DriveHarness) -> None:
     drive.enable(target=1000)
     drive.sdo[0x1006].raw = 1000  # us
     drive.cycle()
@@ -113,7 +113,7 @@ def test_lost_sync_is_a_fault(drive: DriveDesk) -> None:
     assert drive.sdo[0x6078].raw == 0 and drive.cycle()[:2] == (FAULT, 0)
 
 
-def test_a_lost_master_is_a_fault(drive: DriveDesk) -> None:
+def test_a_lost_master_is_a_fault(drive: DriveHarness) -> None:
     drive.sdo[0x1016][1].raw = 1 << 16 | 50  # node 1, ms
     drive.enable(target=1000)
     drive.send(0x701, b"\x05")
@@ -132,11 +132,11 @@ INIT, SYNCHRONISING, OPERATIONAL, ECU_FAULT = 1, 2, 3, 4
 
 
 @pytest.fixture
-def ecu() -> EcuDesk:
+def ecu() -> EcuHarness:
     """An ECU in state 3."""
-    desk = EcuDesk()
-    desk.start()
-    return desk
+    harness = EcuHarness()
+    harness.start()
+    return harness
 
 
 def read(answer: dict[str, float]) -> tuple[float, float]:
@@ -145,7 +145,7 @@ def read(answer: dict[str, float]) -> tuple[float, float]:
 
 
 def test_without_frames_it_says_every_10_ms_that_it_is_there() -> None:
-    ecu = EcuDesk()
+    ecu = EcuHarness()
     for _ in range(195):
         ecu.wait(MS)
     drives = ecu.decode([data for _, _, data in ecu.heard])
@@ -154,7 +154,7 @@ def test_without_frames_it_says_every_10_ms_that_it_is_there() -> None:
 
 
 def test_five_sound_frames_make_it_operational() -> None:
-    ecu = EcuDesk()
+    ecu = EcuHarness()
     assert [ecu.cycle(enable=0)["State"] for _ in range(6)] == [SYNCHRONISING] * 4 + [OPERATIONAL] * 2
 
 
@@ -162,7 +162,7 @@ def test_five_sound_frames_make_it_operational() -> None:
     (1.0, 0.5, 1.8), (-1.0, 0.5, -5.4), (5.0, 0.0, 8.0), (-5.0, 0.0, -8.0), (0.0, 0.00123, -0.004),
     (-8388.608, 1342.17727, -8.0),  # the ends of the ranges
 ])
-def test_current_of_the_ecu_follows_the_error_up_to_its_limit(ecu: EcuDesk, target: float, position: float,
+def test_current_of_the_ecu_follows_the_error_up_to_its_limit(ecu: EcuHarness, target: float, position: float,
                                                               current: float) -> None:
     """3.6 A/m; the derivative part is 0 in the first cycle with a current and while nothing changes."""
     ecu.cycle(target, position, enable=0)
@@ -171,7 +171,7 @@ def test_current_of_the_ecu_follows_the_error_up_to_its_limit(ecu: EcuDesk, targ
 
 
 @pytest.mark.parametrize(("name", "kind"), list(product(("Demand", "Feedback"), ("checksum", "counter"))))
-def test_wrong_frames_are_not_used_and_three_are_a_fault(ecu: EcuDesk, name: str, kind: str) -> None:
+def test_wrong_frames_are_not_used_and_three_are_a_fault(ecu: EcuHarness, name: str, kind: str) -> None:
     ecu.cycle(1.0, 0.5)
     answers = []
     for _ in range(3):
@@ -188,7 +188,7 @@ def test_wrong_frames_are_not_used_and_three_are_a_fault(ecu: EcuDesk, name: str
     assert [ecu.cycle(enable=0)["State"] for _ in range(10)][-1] == OPERATIONAL  # its counters begin anew
 
 
-def test_when_the_frames_stop_the_current_does(ecu: EcuDesk) -> None:
+def test_when_the_frames_stop_the_current_does(ecu: EcuHarness) -> None:
     assert [read(ecu.cycle(1.0, 0.5)) for _ in range(2)] == [(OPERATIONAL, 1.8)] * 2
     ecu.heard.clear()
     for _ in range(120):  # ms; the fault comes after 100

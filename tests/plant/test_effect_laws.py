@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, drive_plant, measure_speed, measure_spool
-from node_bench import FirmwareDesk
+from node_bench import FirmwareHarness
 from physics_cases import SMOOTH
 
 from plant import Actuator, Input, Model, compute_answers, interpret_function, simulate, unpack_state
@@ -295,12 +295,12 @@ def test_readings_are_whole_steps_and_their_error_is_evenly_spread() -> None:
 
 def test_the_rigs_own_firmware_limits_the_rate_too() -> None:
     """Frame by frame, from the first active cycle; and anew after each activation."""
-    desk = FirmwareDesk(Model().replace({"command_rate_limit.rate": 0.1}))
+    harness = FirmwareHarness(Model().replace({"command_rate_limit.rate": 0.1}))
     ramp = [0.0, *(0.1e-3 * k for k in range(1, 6))]
     for _ in range(2):
-        drives = [desk.cycle(CIA408.ladder[-1], demand) for demand in (0.0, *[5e-3] * 5)]
+        drives = [harness.cycle(CIA408.ladder[-1], demand) for demand in (0.0, *[5e-3] * 5)]
         assert [drive and drive.current for drive in drives] == pytest.approx([3.8 * x for x in ramp], abs=1e-8)
-        desk.cycle(0)
+        harness.cycle(0)
 
 
 @pytest.mark.parametrize("changes", [{}, {"command_rate_limit.rate": 0.1}])

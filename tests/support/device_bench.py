@@ -3,13 +3,13 @@
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from node_bench import MS, Desk
+from node_bench import MS, NodeHarness
 
 from dbc import EDS
 from rig.device import Device
 
 
-class Rack(Desk):
+class DeviceHarness(NodeHarness):
     """Node 2 or 3, which does nothing of its own."""
 
     node: Device

@@ -10,7 +10,7 @@ import canopen
 import cantools
 from c_device import CNode, run_program, skip_without_compiler
 from canopen.profiles.p402 import BaseNode402, State402
-from node_bench import MS, Desk
+from node_bench import MS, NodeHarness
 from places import ROOT
 
 from rig.benches import EXTENDED
@@ -42,7 +42,7 @@ class Answer(NamedTuple):
     status: int
 
 
-class DriveDesk(Desk):
+class DriveHarness(NodeHarness):
     """A drive opposite the canopen library, cycle by cycle."""
 
     def __init__(self) -> None:
@@ -107,7 +107,7 @@ def compute_crc(data: bytes) -> int:
     return value ^ 0xFF
 
 
-class EcuDesk(Desk):
+class EcuHarness(NodeHarness):
     """An ECU opposite the cantools library."""
 
     def __init__(self, timeout: int = 100) -> None:

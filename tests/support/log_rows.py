@@ -7,8 +7,8 @@ from mcap.reader import make_reader
 from rig.recorder import Signals, Timing
 
 
-class CycleBook:
-    """A log that keeps the cycles it is told."""
+class CycleList:
+    """A log that keeps each cycle in a list."""
 
     def __init__(self) -> None:
         self.times: list[int] = []

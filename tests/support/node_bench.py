@@ -13,7 +13,7 @@ from rig.nodes import Emulator, Firmware, Scenario
 MS = 1_000_000  # ns
 
 
-class Desk:
+class NodeHarness:
     """A node, booted. What it sends is collected in `heard` as (t_ns, COB-ID, data)."""
 
     def __init__(self, make: Callable[[Send], Emulator | Firmware]) -> None:
@@ -50,8 +50,8 @@ class Desk:
         return [int.from_bytes(data[:2], "little") for data in self.frames(0x080 + self.node.device.node_id)]
 
 
-class PlantDesk(Desk):
-    """The plant emulator, run cycle by cycle by a rig and a controller that do as they are told."""
+class PlantHarness(NodeHarness):
+    """The plant emulator, run cycle by cycle by a rig and a controller that the test plays."""
 
     node: Emulator
 
@@ -94,7 +94,7 @@ class PlantDesk(Desk):
                 codec.unpack_valve_state(self.frames(codec.VALVE_STATE)[-1]))
 
 
-class FirmwareDesk(Desk):
+class FirmwareHarness(NodeHarness):
     """The reference firmware, fed with commands and feedback."""
 
     node: Firmware

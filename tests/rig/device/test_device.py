@@ -6,7 +6,7 @@ The one in C sends the same (tests/rig/firmware/test_c_run.py), and both pass `r
 from pathlib import Path
 
 import pytest
-from device_bench import Rack, change_sheet, describe_variable
+from device_bench import DeviceHarness, change_sheet, describe_variable
 from refusals import catch_refusal
 
 from dbc import EDS
@@ -215,7 +215,7 @@ SCRIPTS = {**SDO, **{name: (3, f"{START}{script}") for name, script in PDO.items
 
 @pytest.mark.parametrize(("node", "script"), SCRIPTS.values(), ids=SCRIPTS)
 def test_script(node: int, script: str) -> None:
-    Rack(node).play(script)
+    DeviceHarness(node).play(script)
 
 
 @pytest.mark.parametrize(("request_", "code"), [
@@ -234,7 +234,7 @@ def test_script(node: int, script: str) -> None:
     ("e0 081000 00000000", Abort.COMMAND),
 ])  # fmt: skip
 def test_aborts(request_: str, code: Abort) -> None:
-    Rack(3).play(f"603 {request_} -> 583 80{request_[3:9]}{code.to_bytes(4, 'little').hex()}")
+    DeviceHarness(3).play(f"603 {request_} -> 583 80{request_[3:9]}{code.to_bytes(4, 'little').hex()}")
 
 
 CHANGED = {  # what is changed in the data sheet of node 3, and a script
@@ -269,7 +269,7 @@ CHANGED = {  # what is changed in the data sheet of node 3, and a script
 
 @pytest.mark.parametrize(("change", "more", "script"), CHANGED.values(), ids=CHANGED)
 def test_script_on_a_changed_data_sheet(tmp_path: Path, change: tuple[str, str, str], more: str, script: str) -> None:
-    Rack(eds=change_sheet(tmp_path, change, more=more)).play(script)
+    DeviceHarness(eds=change_sheet(tmp_path, change, more=more)).play(script)
 
 
 @pytest.mark.parametrize(("old", "new", "complaint"), [

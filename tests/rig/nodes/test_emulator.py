@@ -15,7 +15,7 @@ import codec
 import numpy as np
 import pytest
 from bus_stations import only_udp, raw_kinds, spec
-from node_bench import MS, FirmwareDesk, PlantDesk
+from node_bench import MS, FirmwareHarness, PlantHarness
 
 from plant import Actuator, Model
 from rig.benches import CIA408, load_bench
@@ -44,7 +44,7 @@ from rig.sequences import (
 from rig.sequences.faults import Duplicated, Lost
 
 
-class BusDesk:
+class BusHarness:
     """Rig and controller by hand on a real bus, opposite an `EmulatorService` that runs as `rig node plant` runs it."""
 
     def __init__(self, where: str, scenario: Scenario) -> None:
@@ -52,7 +52,7 @@ class BusDesk:
         self.heard: list[tuple[int, bytes]] = []
 
     @contextmanager
-    def run(self) -> Iterator[BusDesk]:
+    def run(self) -> Iterator[BusHarness]:
         compile_loop()
         stop = threading.Event()
         ready = threading.Event()
@@ -130,22 +130,22 @@ class BusDesk:
 
 
 @pytest.fixture
-def desk(bus_kind: str) -> Iterator[BusDesk]:
+def harness(bus_kind: str) -> Iterator[BusHarness]:
     """A started emulator without noise, in lockstep."""
-    with BusDesk(spec(bus_kind), Scenario(QUIET, Plan(stop=0))).run() as desk:
-        yield desk
+    with BusHarness(spec(bus_kind), Scenario(QUIET, Plan(stop=0))).run() as harness:
+        yield harness
 
 
 QUIET = Model().replace({f"sensors.{what}_noise": 0.0 for what in ("position", "pressure", "spool")})
 
 
-def run_cycle(desk: BusDesk, current: float | None = 0.0) -> codec.ValveState:
+def run_cycle(harness: BusHarness, current: float | None = 0.0) -> codec.ValveState:
     """SYNC, the emulator's two frames, and the drive that answers them (None: none)."""
-    desk.sync()
-    desk.await_frame(codec.FEEDBACK)
-    valve = codec.unpack_valve_state(desk.await_frame(codec.VALVE_STATE))
+    harness.sync()
+    harness.await_frame(codec.FEEDBACK)
+    valve = codec.unpack_valve_state(harness.await_frame(codec.VALVE_STATE))
     if current is not None:
-        desk.drive(current, valve.cycle)
+        harness.drive(current, valve.cycle)
     return valve
 
 
@@ -166,46 +166,46 @@ class TestServices:
     """The CANopen services beside the loop, and what passes between the two."""
 
     @raw_kinds
-    def test_the_record_of_the_cycles_can_be_read(self, desk: BusDesk) -> None:
+    def test_the_record_of_the_cycles_can_be_read(self, harness: BusHarness) -> None:
         before = time.monotonic_ns()
         for _ in range(20):
-            run_cycle(desk)
-        run_cycle(desk, None)
-        run_cycle(desk)
-        record = decode_cycle_record(desk.upload(0x2212))
+            run_cycle(harness)
+        run_cycle(harness, None)
+        run_cycle(harness)
+        record = decode_cycle_record(harness.upload(0x2212))
         after = time.monotonic_ns()
         assert list(record.cycle) == list(range(22))
         assert list(record.flags) == [0] * 21 + [1]
         assert before - MS < record.sync[0] and record.done[-1] < after
         for earlier, later in pairwise((record.sync, record.start, record.sent, record.done)):
             assert np.all(earlier <= later)
-        counts = [int.from_bytes(desk.upload(0x2211, sub), "little") for sub in range(1, 10)]
+        counts = [int.from_bytes(harness.upload(0x2211, sub), "little") for sub in range(1, 10)]
         assert counts[:5] == [1, 0, 22, 0, 0]
         assert abs(counts[7] - int((record.done - record.sync).max()) // 1000) <= 1
         assert counts[8] & 1  # compiled
 
     @only_udp
-    def test_a_short_drive_is_an_emergency_and_counts_as_missing(self, desk: BusDesk) -> None:
-        run_cycle(desk, None)
-        desk.link.send(codec.DRIVE, b"123")
-        assert run_cycle(desk).flags == 1
-        desk.settle()
-        assert next(data[:2] for cob_id, data in desk.heard if cob_id == 0x083) == b"\x10\x82"
+    def test_a_short_drive_is_an_emergency_and_counts_as_missing(self, harness: BusHarness) -> None:
+        run_cycle(harness, None)
+        harness.link.send(codec.DRIVE, b"123")
+        assert run_cycle(harness).flags == 1
+        harness.settle()
+        assert next(data[:2] for cob_id, data in harness.heard if cob_id == 0x083) == b"\x10\x82"
 
     @only_udp
-    def test_a_plant_without_a_number_says_so_and_stops(self, desk: BusDesk) -> None:
-        run_cycle(desk)
-        words = desk.node._memory.words
-        desk.node._memory.reals[words[ec.FLAT_AT]: words[ec.FLAT_AT] + words[ec.FLAT]] = np.nan
-        before = sum(cob_id == codec.FEEDBACK for cob_id, _ in desk.heard)
-        desk.sync()
-        assert desk.await_frame(0x083)[:2] == b"\x00\x60"
-        desk.sync()
-        desk.settle()
-        assert desk.node.device.state is NmtState.PRE_OPERATIONAL
-        assert sum(cob_id == codec.FEEDBACK for cob_id, _ in desk.heard) == before
-        desk.restart()
-        assert run_cycle(desk) == (0.0, 0, 0)
+    def test_a_plant_without_a_number_says_so_and_stops(self, harness: BusHarness) -> None:
+        run_cycle(harness)
+        words = harness.node._memory.words
+        harness.node._memory.reals[words[ec.FLAT_AT]: words[ec.FLAT_AT] + words[ec.FLAT]] = np.nan
+        before = sum(cob_id == codec.FEEDBACK for cob_id, _ in harness.heard)
+        harness.sync()
+        assert harness.await_frame(0x083)[:2] == b"\x00\x60"
+        harness.sync()
+        harness.settle()
+        assert harness.node.device.state is NmtState.PRE_OPERATIONAL
+        assert sum(cob_id == codec.FEEDBACK for cob_id, _ in harness.heard) == before
+        harness.restart()
+        assert run_cycle(harness) == (0.0, 0, 0)
 
     @only_udp
     @pytest.mark.parametrize(("text", "fault"), [
@@ -229,37 +229,37 @@ class TestServices:
             emulator.receive(Frame(0, cob_id, data))
         sent_in_cycle = codec.FEEDBACK, codec.VALVE_STATE, 0x083
         answers = [each for each in answers if each[0] in sent_in_cycle]
-        with BusDesk(spec(bus_kind), scenario).run() as desk:
+        with BusHarness(spec(bus_kind), scenario).run() as harness:
             for each in script:
-                desk.link.send(*each)
+                harness.link.send(*each)
             for _ in range(sum(cob_id == codec.VALVE_STATE for cob_id, _ in answers)):
-                desk.await_frame(codec.VALVE_STATE)
-            desk.settle()
-        assert [each for each in desk.heard if each[0] in sent_in_cycle] == answers
+                harness.await_frame(codec.VALVE_STATE)
+            harness.settle()
+        assert [each for each in harness.heard if each[0] in sent_in_cycle] == answers
 
     @only_udp
     def test_the_loop_ends_with_the_services(self, bus_kind: str) -> None:
-        with BusDesk(spec(bus_kind), Scenario(QUIET, Plan(stop=0))).run() as desk:
-            run_cycle(desk)
-            thread = desk.node._thread
+        with BusHarness(spec(bus_kind), Scenario(QUIET, Plan(stop=0))).run() as harness:
+            run_cycle(harness)
+            thread = harness.node._thread
             assert thread is not None and thread.is_alive()
         assert not thread.is_alive()
 
     @raw_kinds
-    def test_a_transmission_type_and_a_cob_id_set_by_sdo_are_those_of_the_loop(self, desk: BusDesk) -> None:
-        desk.nmt(128)
+    def test_a_transmission_type_and_a_cob_id_set_by_sdo_are_those_of_the_loop(self, harness: BusHarness) -> None:
+        harness.nmt(128)
         for request in (b"\x2f\x00\x18\x02\x02\0\0\0",  # feedback with every second SYNC
                         b"\x23\x00\x14\x01\x82\x01\0\x80", b"\x23\x00\x14\x01\x92\x01\0\0"):  # drive: 0x192
-            desk.link.send(0x603, request)
-            assert desk.await_frame(0x583)[0] == 0x60
-        desk.nmt(1)
+            harness.link.send(0x603, request)
+            assert harness.await_frame(0x583)[0] == 0x60
+        harness.nmt(1)
         flags = []
         for k in range(6):
-            desk.sync()
-            flags.append(codec.unpack_valve_state(desk.await_frame(codec.VALVE_STATE)).flags)
-            desk.link.send(0x192, codec.pack_drive(0.0, 15, k))
+            harness.sync()
+            flags.append(codec.unpack_valve_state(harness.await_frame(codec.VALVE_STATE)).flags)
+            harness.link.send(0x192, codec.pack_drive(0.0, 15, k))
         assert flags == [0] * 6
-        assert sum(cob_id == codec.FEEDBACK for cob_id, _ in desk.heard) == 3
+        assert sum(cob_id == codec.FEEDBACK for cob_id, _ in harness.heard) == 3
 
 
 STOP = 200
@@ -271,27 +271,27 @@ def scenario(*faults: Fault, model: Model = QUIET, load: tuple[int, ...] = (), s
     return Scenario(model.with_effects(groups), plan, load)
 
 
-def counters(desk: PlantDesk) -> tuple[int, ...]:
-    replies = [desk.send(0x603, b"\x40\x11\x22" + bytes((sub, 0, 0, 0, 0))) for sub in (1, 2)]  # object 0x2211
+def counters(harness: PlantHarness) -> tuple[int, ...]:
+    replies = [harness.send(0x603, b"\x40\x11\x22" + bytes((sub, 0, 0, 0, 0))) for sub in (1, 2)]  # object 0x2211
     return tuple(int.from_bytes(data[4:], "little") for data, in replies)
 
 
-def read_reals(desk: PlantDesk, place: int, count: int = 1) -> list[float]:
+def read_reals(harness: PlantHarness, place: int, count: int = 1) -> list[float]:
     """Numbers of the memory that the cycle works on."""
-    return list(desk.node._memory.reals[place:place + count])
+    return list(harness.node._memory.reals[place:place + count])
 
 
 def test_the_answer_to_cycle_k_acts_from_cycle_k_plus_1() -> None:
     """Sample 1 saw a plant without current, sample 2 one millisecond of it: as the plant alone, to the bit."""
-    desk, alone = PlantDesk(scenario()), Actuator(QUIET)
+    harness, alone = PlantHarness(scenario()), Actuator(QUIET)
     currents = [4e-3, -2e-3, 0.0, 1e-3, 3e-3]
     for k, current in enumerate(currents):
-        feedback, valve = desk.cycle(current)
+        feedback, valve = harness.cycle(current)
         xj, p12, xs = alone.sample()
         assert feedback == codec.unpack_feedback(codec.pack_feedback(xj, p12))
         assert valve == codec.unpack_valve_state(codec.pack_valve_state(xs, 0, k))
         alone.advance(currents[k - 1] if k else 0.0)
-    assert counters(desk) == (0, 0)
+    assert counters(harness) == (0, 0)
 
 
 @pytest.mark.parametrize(("drives", "flags", "counts", "emergencies", "current"), [
@@ -304,10 +304,11 @@ def test_the_answer_to_cycle_k_acts_from_cycle_k_plus_1() -> None:
 def test_missing_and_late_drives(drives: str, flags: list[int], counts: tuple[int, int], emergencies: list[int],
                                  current: float) -> None:
     """A drive after each SYNC: one that answers it, none (-), or one that answers another cycle (<)."""
-    desk = PlantDesk(scenario())
-    assert [desk.cycle(None if drive == "-" else 2e-3, answers=60_000 if drive == "<" else None)[1].flags
+    harness = PlantHarness(scenario())
+    assert [harness.cycle(None if drive == "-" else 2e-3, answers=60_000 if drive == "<" else None)[1].flags
             for drive in drives] == flags
-    assert (counters(desk), desk.emergencies(), read_reals(desk, ec.IN_FORCE)) == (counts, emergencies, [current])
+    assert (counters(harness), harness.emergencies(), read_reals(harness, ec.IN_FORCE)) == (
+        counts, emergencies, [current])
 
 
 @pytest.mark.parametrize(("fault", "two", "counts"), [
@@ -315,39 +316,39 @@ def test_missing_and_late_drives(drives: str, flags: list[int], counts: tuple[in
     (Late(frame="drive", start=0.003, end=0.004, delay=1.5e-3), [1, 2], (1, 1)),
     (Late(frame="drive", start=0.003, end=0.004, delay=0.5e-3), [0, 0], (0, 0))])  # what comes last counts
 def test_lost_and_late_drive_as_the_plan_says(fault: Fault, two: list[int], counts: tuple[int, int]) -> None:
-    desk = PlantDesk(scenario(fault))
-    assert [desk.cycle(1e-3)[1].flags for _ in range(8)] == [0, 0, 0, 0, *two, 0, 0]
-    assert counters(desk) == counts
+    harness = PlantHarness(scenario(fault))
+    assert [harness.cycle(1e-3)[1].flags for _ in range(8)] == [0, 0, 0, 0, *two, 0, 0]
+    assert counters(harness) == counts
 
 
 def test_feedback_lost_and_late() -> None:
     """A late frame carries what was sampled, not what is true by then."""
-    desk = PlantDesk(scenario(Lost(frame="feedback", start=0.002, end=0.003),
+    harness = PlantHarness(scenario(Lost(frame="feedback", start=0.002, end=0.003),
                               Late(frame="feedback", start=0.004, end=0.005, delay=1.5e-3),
                               Lost(frame="valve_state", start=0.005, end=0.006)))
     for _ in range(8):
-        desk.cycle(5e-3)
-    when = [t_ns / MS for t_ns, cob, _ in desk.heard if cob == codec.FEEDBACK]
+        harness.cycle(5e-3)
+    when = [t_ns / MS for t_ns, cob, _ in harness.heard if cob == codec.FEEDBACK]
     assert when == [0, 1, 3, 5, 6, 6, 7]  # that of cycle 4 was due at 5.5 ms, the tick is at 6
-    assert [codec.unpack_valve_state(data).cycle for data in desk.frames(codec.VALVE_STATE)] == [0, 1, 2, 3, 4, 6, 7]
-    sound = PlantDesk(scenario())
+    assert [codec.unpack_valve_state(data).cycle for data in harness.frames(codec.VALVE_STATE)] == [0, 1, 2, 3, 4, 6, 7]
+    sound = PlantHarness(scenario())
     for _ in range(8):
         sound.cycle(5e-3)
-    assert sorted(desk.frames(codec.FEEDBACK)) == sorted(
+    assert sorted(harness.frames(codec.FEEDBACK)) == sorted(
         data for k, data in enumerate(sound.frames(codec.FEEDBACK)) if k != 2)
 
 
 def test_sensor_faults_show_in_the_frames_only() -> None:
-    desk = PlantDesk(scenario(Stuck(signal="xj", start=0.002, end=0.004, value=3e-3),
+    harness = PlantHarness(scenario(Stuck(signal="xj", start=0.002, end=0.004, value=3e-3),
                               Offset(signal="p12", start=0.004, end=0.006, value=1e6),
                               Noise(signal="xs", start=0.006, value=1e-6)))
-    sound = PlantDesk(scenario())
-    a, b = [[d.cycle(1e-3) for _ in range(20)] for d in (desk, sound)]
+    sound = PlantHarness(scenario())
+    a, b = [[d.cycle(1e-3) for _ in range(20)] for d in (harness, sound)]
     assert [f.position for f, _ in a[2:4]] == [3e-3, 3e-3]
     assert [x.pressure - y.pressure for (x, _), (y, _) in zip(a[4:6], b[4:6], strict=True)] == pytest.approx([1e6, 1e6])
     assert [x for x, _ in a[6:]] == [y for y, _ in b[6:]]
     assert np.std([x.spool - y.spool for (_, x), (_, y) in zip(a[6:], b[6:], strict=True)]) > 3e-7
-    ours, other = (read_reals(each, *each.node._memory.words[[ec.FLAT_AT, ec.FLAT]]) for each in (desk, sound))
+    ours, other = (read_reals(each, *each.node._memory.words[[ec.FLAT_AT, ec.FLAT]]) for each in (harness, sound))
     assert ours == other
 
 
@@ -373,22 +374,22 @@ def test_noise_has_its_size_and_depends_on_seed_and_cycle_only() -> None:
 
 def test_after_a_pause_the_cycle_is_that_of_the_bus_and_no_fault_was_slept_through() -> None:
     """A fault that ended meanwhile has ended; one that began has begun; the first cycle is nobody's miss."""
-    desk = PlantDesk(Scenario(QUIET, Plan(faults=(
+    harness = PlantHarness(Scenario(QUIET, Plan(faults=(
         Parameter(parameter="filter.clogging", value=0.4, start=0.002, end=0.012),
         Parameter(parameter="spool.dynamic_friction", value=1.0, start=0.013)), stop=STOP)))
     for _ in range(5):
-        desk.cycle(1e-3)
-    desk.nmt(128)
+        harness.cycle(1e-3)
+    harness.nmt(128)
     for _ in range(10):
-        desk.send(codec.SYNC)
-        desk.k += 1
-        desk.wait(MS)
-    desk.nmt(1)
-    signals = [desk.cycle(1e-3)[1] for _ in range(3)]
-    assert [(s.cycle, s.flags) for s in signals] == [(15, 0), (16, 0), (17, 0)] and counters(desk) == (0, 0)
-    names, live = QUIET.list_names(), int(desk.node._memory.words[ec.LIVE_AT])
-    assert [read_reals(desk, live + names.index(name)) for name in ("filter.clogging", "spool.dynamic_friction")] == [
-        [0.0], [1.0]]
+        harness.send(codec.SYNC)
+        harness.k += 1
+        harness.wait(MS)
+    harness.nmt(1)
+    signals = [harness.cycle(1e-3)[1] for _ in range(3)]
+    assert [(s.cycle, s.flags) for s in signals] == [(15, 0), (16, 0), (17, 0)] and counters(harness) == (0, 0)
+    names, live = QUIET.list_names(), int(harness.node._memory.words[ec.LIVE_AT])
+    assert [read_reals(harness, live + names.index(name))
+            for name in ("filter.clogging", "spool.dynamic_friction")] == [[0.0], [1.0]]
 
 
 def table(**changes: object) -> bytes:
@@ -423,35 +424,35 @@ REFUSED = {
 
 @pytest.mark.parametrize("what", REFUSED)
 def test_garbage_is_refused_and_the_plant_stays_as_it_was(what: str) -> None:
-    desk = PlantDesk(scenario(Parameter(parameter="filter.clogging", value=0.4, start=0.0)), start=False)
-    before = desk.node._scenario
-    assert desk.download(REFUSED[what]) == Abort.VALUE
-    assert desk.node._scenario == before
-    desk.nmt(130)  # a reset makes the plant of the scenario anew
-    desk.nmt(1)
-    assert desk.cycle()[1] == (0.0, 0, 0)
+    harness = PlantHarness(scenario(Parameter(parameter="filter.clogging", value=0.4, start=0.0)), start=False)
+    before = harness.node._scenario
+    assert harness.download(REFUSED[what]) == Abort.VALUE
+    assert harness.node._scenario == before
+    harness.nmt(130)  # a reset makes the plant of the scenario anew
+    harness.nmt(1)
+    assert harness.cycle()[1] == (0.0, 0, 0)
 
 
 def test_no_new_plant_while_one_runs() -> None:
-    desk = PlantDesk(scenario())
-    assert desk.download(scenario().to_bytes()) == Abort.STATE
+    harness = PlantHarness(scenario())
+    assert harness.download(scenario().to_bytes()) == Abort.STATE
 
 
 ACTIVE, RESET = CIA408.ladder[-1], CIA408.reset
 
 
-def pause(desk: FirmwareDesk) -> None:
+def pause(harness: FirmwareHarness) -> None:
     """PRE-OPERATIONAL and back."""
-    desk.nmt(128)
-    desk.nmt(1)
+    harness.nmt(128)
+    harness.nmt(1)
 
 
-def set_gain(desk: FirmwareDesk, sub: int, value: float) -> int:
+def set_gain(harness: FirmwareHarness, sub: int, value: float) -> int:
     """SDO download of a REAL64; the abort code or 0."""
-    desk.send(0x602, b"\x21" + GAINS.to_bytes(2, "little") + bytes((sub, 8, 0, 0, 0)))
+    harness.send(0x602, b"\x21" + GAINS.to_bytes(2, "little") + bytes((sub, 8, 0, 0, 0)))
     data = struct.pack("<d", value)
-    desk.send(0x602, b"\x00" + data[:7])
-    reply = desk.send(0x602, b"\x1d" + data[7:].ljust(7, b"\0"))[0]
+    harness.send(0x602, b"\x00" + data[:7])
+    reply = harness.send(0x602, b"\x1d" + data[7:].ljust(7, b"\0"))[0]
     return int.from_bytes(reply[4:], "little") if reply[0] == 0x80 else 0
 
 
@@ -461,35 +462,35 @@ def set_gain(desk: FirmwareDesk, sub: int, value: float) -> int:
 ])
 def test_the_levels_build_on_each_other(control: int, status: int) -> None:
     """Current flows with all three, and none is skipped."""
-    drive = FirmwareDesk().cycle(control, demand=1e-3)
+    drive = FirmwareHarness().cycle(control, demand=1e-3)
     assert drive is not None and drive.status == status
     assert (drive.current != 0) == (control == ACTIVE)
 
 
 def test_lost_feedback_is_a_fault_that_is_latched_until_its_cause_is_gone_and_reset_rises() -> None:
-    desk = FirmwareDesk()
-    desk.cycle(ACTIVE | RESET, 1e-3)  # a bit that is up already acknowledges nothing
-    drives = [desk.cycle(ACTIVE | RESET, 1e-3, position=None) for _ in range(LOST_AFTER + 1)]
+    harness = FirmwareHarness()
+    harness.cycle(ACTIVE | RESET, 1e-3)  # a bit that is up already acknowledges nothing
+    drives = [harness.cycle(ACTIVE | RESET, 1e-3, position=None) for _ in range(LOST_AFTER + 1)]
     assert [d is not None for d in drives] == [False] * LOST_AFTER + [True]
     assert drives[-1] is not None and (drives[-1].current, drives[-1].status) == (0.0, 0)
-    desk.cycle(ACTIVE, position=None)
-    desk.cycle(ACTIVE | RESET, position=None)  # while the cause stands
-    assert desk.emergencies() == [0x8250]
-    assert not desk.status(ACTIVE | RESET, 2)
-    assert desk.emergencies() == [0x8250, 0]  # feedback is back, the fault is not
-    assert not desk.status(ACTIVE, 1)
-    assert desk.status(ACTIVE | RESET, 1) == ACTIVE | 8
-    assert desk.status(ACTIVE, 1) == ACTIVE | 8
+    harness.cycle(ACTIVE, position=None)
+    harness.cycle(ACTIVE | RESET, position=None)  # while the cause stands
+    assert harness.emergencies() == [0x8250]
+    assert not harness.status(ACTIVE | RESET, 2)
+    assert harness.emergencies() == [0x8250, 0]  # feedback is back, the fault is not
+    assert not harness.status(ACTIVE, 1)
+    assert harness.status(ACTIVE | RESET, 1) == ACTIVE | 8
+    assert harness.status(ACTIVE, 1) == ACTIVE | 8
 
 
 def test_a_restart_takes_the_fault_but_not_the_error_that_stands() -> None:
     """START after a pause: the emergency is taken back with the first feedback, and the next fault can be reset."""
-    desk = FirmwareDesk()
+    harness = FirmwareHarness()
     for _ in range(LOST_AFTER + 1):
-        desk.cycle(ACTIVE, position=None)
-    pause(desk)
-    assert desk.status(ACTIVE, 1) == ACTIVE | 8
-    assert desk.emergencies() == [0x8250, 0] and desk.node.device.emcy.active == []
+        harness.cycle(ACTIVE, position=None)
+    pause(harness)
+    assert harness.status(ACTIVE, 1) == ACTIVE | 8
+    assert harness.emergencies() == [0x8250, 0] and harness.node.device.emcy.active == []
 
 
 @pytest.mark.parametrize(("sub", "value", "is_taken"), [
@@ -497,8 +498,8 @@ def test_a_restart_takes_the_fault_but_not_the_error_that_stands() -> None:
     (4, -1e-3, False), (4, 0.0, True), (5, 0.0, False), (5, -1e-3, False), (5, 5e-324, True),
 ])
 def test_gains_that_cannot_be_are_refused(sub: int, value: float, is_taken: bool) -> None:
-    desk = FirmwareDesk()
-    assert set_gain(desk, 3, 1.0) == 0  # with a derivative part the period is divided by
-    assert set_gain(desk, sub, value) == (0 if is_taken else Abort.VALUE)
-    pause(desk)
-    assert [desk.cycle(ACTIVE, 1e-3 * k) is not None for k in range(3)] == [True] * 3
+    harness = FirmwareHarness()
+    assert set_gain(harness, 3, 1.0) == 0  # with a derivative part the period is divided by
+    assert set_gain(harness, sub, value) == (0 if is_taken else Abort.VALUE)
+    pause(harness)
+    assert [harness.cycle(ACTIVE, 1e-3 * k) is not None for k in range(3)] == [True] * 3

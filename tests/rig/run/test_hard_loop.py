@@ -17,7 +17,7 @@ from typing import Any
 import codec
 import pytest
 from bus_stations import only_udp, raw_kinds, spec
-from log_rows import CycleBook
+from log_rows import CycleList
 from numba.core.event import install_recorder
 
 from plant import Model
@@ -85,7 +85,7 @@ class Nodes(threading.Thread):
         return names
 
 
-class Bench(CycleBook):
+class Bench(CycleList):
     """A loop on a bus with nodes, and a log of all it says."""
 
     def __init__(self, where: str, realtime: bool, faults: tuple[Fault, ...], ahead: int) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import codec
 import pytest
-from log_rows import CycleBook
+from log_rows import CycleList
 
 from plant import Model
 from rig.benches import load_bench
@@ -61,8 +61,8 @@ class Bench:
         return [t for t, cob_id, _ in self.sent if cob_id == codec.SYNC]
 
 
-def loop(bench: Bench, realtime: bool = True) -> tuple[CycleLoop, CycleBook]:
-    book = CycleBook()
+def loop(bench: Bench, realtime: bool = True) -> tuple[CycleLoop, CycleList]:
+    book = CycleList()
     schedule = Schedule(Plan(stop=1000))
     master, scenario = Master(bench, bench.clock.now, False, load_bench()), Scenario(Model(), Plan(stop=0))
     return CycleLoop(master, load_bench(), scenario, schedule, book, realtime), book

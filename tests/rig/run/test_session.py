@@ -206,7 +206,7 @@ def test_a_load_that_no_node_takes_is_bad_input(tmp_path: Path) -> None:
 
 def test_a_node_that_sends_nothing_but_emergencies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """20,000 of them: the verdict stays small and counts them, the log has them all."""
-    class Babbler(Firmware):
+    class BusyFirmware(Firmware):
         def __init__(self, send: Send, **more: Any) -> None:
             super().__init__(send, **more)
             drive = self.device.on_sync
@@ -218,7 +218,7 @@ def test_a_node_that_sends_nothing_but_emergencies(tmp_path: Path, monkeypatch: 
 
             self.device.on_sync = on_sync
 
-    monkeypatch.setattr(participants, "Firmware", Babbler)
+    monkeypatch.setattr(participants, "Firmware", BusyFirmware)
     outcome = play(job(SAFE), tmp_path)
     assert (tmp_path / "verdict.json").stat().st_size < 100_000
     verdict = json.loads((tmp_path / "verdict.json").read_text())
