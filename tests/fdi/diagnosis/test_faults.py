@@ -200,6 +200,7 @@ def test_backlash_is_measured_although_rows_hang_on_its_impacts() -> None:
 
 def test_a_plant_and_faults_of_ones_own(here: Path) -> None:
     """`rig fdi`, `rig campaign` and `rig trend` with both; bands and maps speak of this plant and of no other."""
+    pytest.importorskip("pyarrow", reason="the extra fleet is not installed")
     assert rig("new", "plant", "new_plant").status == 0
     Path("faults.toml").write_text("""
 [faults.bearing]
