@@ -15,7 +15,7 @@ from plant.segments import Array
 
 
 class Diverged(RigError):
-    """A program has stopped, or has returned a number that is not finite: no run is possible with its parameters."""
+    """A program stopped, or returned a number that is not finite: its parameters allow no run."""
 
 
 class Program(Protocol):

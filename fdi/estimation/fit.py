@@ -485,7 +485,7 @@ def _begin_fit(problem: Problem, free: Sequence[Free], x: Floats) -> Fit:
     misfit = float(compute_misfit(white[:1])[0])
     none = np.empty(0)  # Jacobian and covariance follow
     fit = Fit(tuple(free), x, misfit + float(x**2 @ weigh_priors(free)), misfit, none,
-                problem.subtract_measurements(predictions[:1])[0], white[0].copy(), none)
+              problem.subtract_measurements(predictions[:1])[0], white[0].copy(), none)
     return _take_differences(fit, white[1:], moves)
 
 

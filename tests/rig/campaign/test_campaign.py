@@ -222,7 +222,7 @@ def test_a_folder_of_traces_is_judged_and_a_changed_trace_is_another_campaign(tm
 
 def test_rig_fdi_in_a_campaign_finds_both_faults_and_the_statistics_are_written(tmp_path: Path) -> None:
     result = rig("campaign", "--fault", "filter_clogging=0.17/spool_friction=45", "--seeds", 1, "--tolerance", 0,
-               "--out", tmp_path, "--json", "--jobs", 1)
+                 "--out", tmp_path, "--json", "--jobs", 1)
     row, = judge.read_campaign_rows(tmp_path)
     assert row["status"] == "ok" and result.json["cases"] == 1, row["reason"]
     assert row["kintas"] == pytest.approx(0.17, rel=0.1) and row["fss"] == pytest.approx(45.0, rel=0.05)

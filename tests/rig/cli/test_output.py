@@ -102,7 +102,7 @@ def test_a_full_disk_leaves_what_was_there_and_no_part(tmp_path: Path, name: str
         for file, content in before.items():
             (out / file).write_bytes(content)
         result = subprocess.run([sys.executable, "-B", "-m", "rig.cli.main", *words], capture_output=True, text=True,
-                              preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (SMALLEST, SMALLEST)))
+                                preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (SMALLEST, SMALLEST)))
         assert (result.returncode, result.stderr.count("\n")) == (2, 1), result
         assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 

@@ -100,7 +100,7 @@ def test_a_unit_needs_no_interpreter_and_two_exports_are_one_file(
     subprocess.run(["cc", str(source), "-o", str(driver), "-ldl"], check=True)
     words = [driver, tmp_path / "binaries" / platforms[0] / "eha.so", guid, 7, 1e-3, first, len(outputs) - 1, seed_at]
     result = subprocess.run([str(word) for word in words], input="\n".join(x.hex() for x in COMMAND.tolist()),
-                          capture_output=True, text=True, check=True)
+                            capture_output=True, text=True, check=True)
     rows = np.array([[float.fromhex(word) for word in line.split()] for line in result.stdout.splitlines()])
     reference = simulate(choose_model("nominal"), COMMAND, seed=7)
     assert rows.tobytes() == np.column_stack([reference.xj, reference.p12, reference.xs]).tobytes()

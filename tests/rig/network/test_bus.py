@@ -349,7 +349,7 @@ def test_a_controller_of_python_can_and_canopen_alone_passes_a_run(tmp_path: Pat
             boot = bus.recv(60.0)
             assert boot is not None and (boot.arbitration_id, bytes(boot.data)) == (0x702, b"\0")
         result = rig("run", short, "--bus", f"udp_multicast:{group}", "--controller", "external",
-                   "--out", tmp_path / "out", "--json")
+                     "--out", tmp_path / "out", "--json")
     finally:
         other.terminate()
         other.wait(120)

@@ -324,8 +324,8 @@ def test_lost_and_late_drive_as_the_plan_says(fault: Fault, two: list[int], coun
 def test_feedback_lost_and_late() -> None:
     """A late frame carries what was sampled, not what is true by then."""
     harness = PlantHarness(scenario(Lost(frame="feedback", start=0.002, end=0.003),
-                              Late(frame="feedback", start=0.004, end=0.005, delay=1.5e-3),
-                              Lost(frame="valve_state", start=0.005, end=0.006)))
+                                    Late(frame="feedback", start=0.004, end=0.005, delay=1.5e-3),
+                                    Lost(frame="valve_state", start=0.005, end=0.006)))
     for _ in range(8):
         harness.cycle(5e-3)
     when = [t_ns / MS for t_ns, cob, _ in harness.heard if cob == codec.FEEDBACK]
@@ -340,8 +340,8 @@ def test_feedback_lost_and_late() -> None:
 
 def test_sensor_faults_show_in_the_frames_only() -> None:
     harness = PlantHarness(scenario(Stuck(signal="xj", start=0.002, end=0.004, value=3e-3),
-                              Offset(signal="p12", start=0.004, end=0.006, value=1e6),
-                              Noise(signal="xs", start=0.006, value=1e-6)))
+                                    Offset(signal="p12", start=0.004, end=0.006, value=1e6),
+                                    Noise(signal="xs", start=0.006, value=1e-6)))
     sound = PlantHarness(scenario())
     a, b = [[d.cycle(1e-3) for _ in range(20)] for d in (harness, sound)]
     assert [f.position for f, _ in a[2:4]] == [3e-3, 3e-3]

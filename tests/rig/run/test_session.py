@@ -355,7 +355,7 @@ def test_with_faults_loads_a_recorded_command_and_the_users_effect(tmp_path: Pat
                                                '  { name = "back"')
     (origin / "faulty.toml").write_text(text)
     result = rig("run", origin / "faulty.toml", "--effects", origin / "creep.py", "--seed", 3, "--quiet", "--out",
-               tmp_path / "a", "--set", "creep.rate=1e-4")
+                 tmp_path / "a", "--set", "creep.rate=1e-4")
     assert result.status == 0, result
     for path in origin.iterdir():
         path.unlink()
@@ -372,7 +372,7 @@ def test_two_effect_files_of_one_name_are_refused(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "mine.py").write_text(EFFECT.replace("creep", name))
     result = rig("run", "--effects", tmp_path / "a" / "mine.py", "--effects", tmp_path / "b" / "mine.py", "--out",
-               tmp_path / "out")
+                 tmp_path / "out")
     assert result.status == 2 and "mine.py" in result.err and len(result.err.splitlines()) == 1
 
 
@@ -387,6 +387,6 @@ def test_a_log_without_what_decides_is_refused(tmp_path: Path, missing: str) -> 
 def test_bus_and_pace_may_be_asked_for_anew(tmp_path: Path) -> None:
     play(job(seed=4), tmp_path / "a")
     result = rig("run", "--from", tmp_path / "a" / "trace.mcap", "--pace", "realtime", "--max-overruns", 1, "--json",
-               "--out", tmp_path / "b")
+                 "--out", tmp_path / "b")
     assert result.json["run"]["pace"] == "realtime" and result.json["run"]["seed"] == 4
     assert same(tmp_path / "a", tmp_path / "b")

@@ -272,9 +272,9 @@ BAD += [(HEAD + f'checks = [{{ name = "c", {keys} }}]\n', f"mine.toml:3: checks[
 BAD += [(HEAD + f'guards = [{{ name = "g", signal = "xj"{keys} }}]\n',
          f"mine.toml:3: guards[0]{key}: expected {expected}")
         for keys, key, expected in (("", "", "a low, a high, or both"),
-                                (", low = 1, high = 1", "", "a low, a high, or both"),
-                                (", high = 1, cycles = 0", ".cycles", "a whole number from 1, not 0"),
-                                (', high = 1, unit = "bar"', ".unit", "'cm', 'inch', 'm'"))]
+                                    (", low = 1, high = 1", "", "a low, a high, or both"),
+                                    (", high = 1, cycles = 0", ".cycles", "a whole number from 1, not 0"),
+                                    (', high = 1, unit = "bar"', ".unit", "'cm', 'inch', 'm'"))]
 BAD += [(f"{HEAD}[{table}]\n{pair}\n", f"mine.toml:4: {table}.{pair.split()[0]}: expected {expected}")
         for table, pair, expected in (
             ("timing", 'overruns = "ignore"', "'abort' or 'count', not 'ignore'"),

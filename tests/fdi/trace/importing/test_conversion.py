@@ -302,7 +302,7 @@ def test_mf4_with_times_of_its_own_and_two_chamber_pressures(folder: Path, origi
 
 def test_blf_with_the_users_dbc(folder: Path, original: dict) -> None:
     answer = rig("import", folder / "log.blf", "--map", folder / "can.toml", "--dbc", folder / "user.dbc",
-               "--out", folder / "can.mcap", "--json").json
+                 "--out", folder / "can.mcap", "--json").json
     assert answer["cycles"] == 1500 and answer["format"] == "CAN log, user.dbc"
     trace, want = Trace.read(folder / "can.mcap"), Trace.read(folder / "original.csv")
     for name, lsb in zip(SIGNALS, (1e-8, 1e-8, 1e-8, 10.0, 1e-9), strict=True):
@@ -312,7 +312,7 @@ def test_blf_with_the_users_dbc(folder: Path, original: dict) -> None:
 
 def test_guess_of_a_can_log(folder: Path) -> None:
     answer = rig("import", "--guess", folder / "log.blf", "--dbc", folder / "user.dbc", "--out", folder / "blf.toml",
-               "--json").json
+                 "--json").json
     sources = {name: entry["source"] for name, entry in answer["signals"].items()}
     assert sources == {"time": "its own times", "com": "Demand.Target", "xj": "Ram.Stroke", "cor": "Valve.Current",
                        "p12": "Ram.DeltaP", "xs": "Valve.Spool"}
