@@ -10,6 +10,7 @@ import atexit
 import contextlib
 import dis
 import fcntl
+import gc
 import hashlib
 import math
 import os
@@ -168,13 +169,14 @@ def _compile_in_one_process(dispatcher: Any, folder: Path) -> None:
     compile_here = dispatcher.compile
 
     def compile_alone(signature: Any) -> Any:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            lock = (folder / "lock").open("w")
-        except OSError:
-            return compile_here(signature)
-        with lock:  # closing it, also by a kill, frees it
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError):
+                folder.mkdir(parents=True, exist_ok=True)
+                lock = stack.enter_context((folder / "lock").open("w"))  # closing it, also by a kill, frees it
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            if gc.isenabled():  # a compiler makes objects that stay: to look for others takes a tenth of its time
+                gc.disable()
+                stack.callback(gc.enable)
             return compile_here(signature)
 
     dispatcher.compile = compile_alone
@@ -323,11 +325,6 @@ def _list_global_names(code: CodeType) -> tuple[str, ...]:
     return tuple(sorted({i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"}))
 
 
-@cache
-def _divides(code: CodeType) -> bool:
-    return any(i.opname == "BINARY_OP" and i.argrepr == "/" for i in dis.get_instructions(code))
-
-
 def _find_calls(function: Function) -> dict[str, Function]:
     values = {name: _find_own_version(value) for name, value in _find_globals(function).items()}
     return {name: g for name, g in values.items() if isinstance(g, FunctionType) or hasattr(g, "py_func")}
@@ -344,7 +341,8 @@ def is_costly(function: Function) -> bool:
     """Whether `function`, or one that it calls, divides or calls an elementary function."""
     plain: Any = getattr(function, "py_func", function)
     elementary = {f.__name__ for f in functions.IN_PLACE_OF} | {"sqrt"}
-    return (_divides(plain.__code__) or not elementary.isdisjoint(plain.__code__.co_names)
+    divides = any(i.opname == "BINARY_OP" and i.argrepr == "/" for i in dis.get_instructions(plain.__code__))
+    return (divides or not elementary.isdisjoint(plain.__code__.co_names)
             or any(map(is_costly, _find_calls(plain).values())))
 
 
