@@ -10,8 +10,7 @@ ARGS   ?=
 # one more than there are CPUs: tests of programs on a bus wait for half of their time
 WORKERS ?= $(shell expr $$(nproc) + 1)
 BIN    := $(VENV)/bin
-# no byte code beforehand: Python makes it where a module is first loaded, and most of them never are (20 s of 60)
-PIP    := $(BIN)/python -m pip --disable-pip-version-check install -qq --no-compile
+PIP    := $(BIN)/python -m pip --disable-pip-version-check install -qq
 MADE   := $(VENV)/.made
 # with it each program that a test starts would compile the whole rig again (1.5 s)
 unexport PYTHONDONTWRITEBYTECODE

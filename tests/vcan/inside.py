@@ -28,9 +28,10 @@ RIG = Path(sys.executable).with_name("rig")
 
 def compile_all(out: Path) -> int:
     """Compile what the other parts use: cycles, plant, functions of the raw bus, C programs. Always 0."""
+    import numpy as np
     from example_devices import ECU
 
-    from plant import Model, compile_function
+    from plant import Model, compile_function, simulate
     from rig.firmware.build import build_controller, build_device
     from rig.network import raw_bus
     from rig.nodes import CompiledPlant
@@ -45,11 +46,13 @@ def compile_all(out: Path) -> int:
     compile_function(raw_bus.receive_frame)(port, 0)
     compile_function(raw_bus.await_frame)(port)
     compile_function(raw_bus.send_frame)(port, 0x80, 0, 0)
+    compile_function(raw_bus.send_payload)(port, 0x80, 0)
     compile_cycle()
     compile_loop()
     load_parts()
     load_service()
     CompiledPlant(Model())
+    simulate(Model(), np.zeros(2))
     return 0
 
 
