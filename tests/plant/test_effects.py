@@ -1,5 +1,6 @@
 """The catalogue: what it says of itself, what every law must keep to; a user's own effects, good and bad."""
 
+import gc
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -239,6 +240,7 @@ def test_a_law_that_cannot_run_is_refused(file: Path, body: str, port: str, use:
     start = COGGING.index("    return x +")
     load_text(file, COGGING[:start].replace("load", port) + f"    {body}\n")
     assert "cogging" in catch_refusal(use, Model().with_effects(["cogging"]))
+    assert gc.isenabled()  # it is off while a law is compiled
 
 
 @pytest.mark.parametrize(("text", "name", "sized"), [
