@@ -15,7 +15,7 @@ from plant.segments import Array
 
 
 class Diverged(RigError):
-    """A program stopped, or returned a number that is not finite: its parameters allow no run."""
+    """A program cannot run with its parameters: it stopped, or returned a number that is not finite."""
 
 
 class Program(Protocol):
