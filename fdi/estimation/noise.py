@@ -44,7 +44,7 @@ class Floor(NamedTuple):
     """RMS that the noise alone leaves of a residual, in the residual's unit, and how it is known."""
 
     value: float
-    source: str  # "repeats", "model" (its sensors.* noise), "data" (second differences), "none"
+    source: str  # "repeats", "model" (its sensors.* noise), "data" (its second differences), "none"
     lower_bound: bool = False  # True: the noise is at least that large
     share: float = 1.0  # of the windows, those that hold noise alone
     difference: float = float("nan")  # rms(r - r_repeat)/sqrt 2 over all rows: noise, and what did not repeat
@@ -77,14 +77,29 @@ def floor_from_repeats(residual: Floats, repeats: Sequence[Floats], period: floa
 
 def floor_from_data(signal: Floats) -> Floor:
     """A lower bound from one signal's own second differences, (n,): noise that is not white has less in them."""
-    second = np.abs(np.diff(signal, 2))
-    second = second[~np.isnan(second)]
-    if not len(second):
+    second = np.diff(signal, 2)
+    if np.isnan(second).all():
         return Floor(0.0, "none", True)
     # the median, scaled to a standard deviation, does not see the few samples in which the signal itself bends
-    spread = float(np.median(second)) / float(ndtri(0.75))
+    spread = float(np.nanmedian(np.abs(second))) / float(ndtri(0.75))
     white_difference = 6.0  # variance of the second difference of white noise, over its own
-    return Floor(spread / np.sqrt(white_difference), "data", True)
+    return Floor(float(min(spread / np.sqrt(white_difference), _measure_spectrum(second))), "data", True)
+
+
+def _measure_spectrum(second: Floats) -> float:
+    """RMS of white noise from the upper half of the spectrum of its second differences, (n,); inf if they are too few.
+
+    The median over frequencies does not see a line or a resonance, which second differences themselves take for noise.
+    """
+    frequencies = np.arange(WINDOW // 4, WINDOW // 2)  # periods in a window
+    taper = np.hanning(WINDOW)
+    pieces = _cut_windows(second, WINDOW)
+    pieces = pieces[~np.isnan(pieces).any(axis=1)]
+    if not len(pieces):
+        return float("inf")
+    power = np.abs(np.fft.rfft(pieces * taper)[:, frequencies]) ** 2 / np.sum(taper**2)
+    power /= (2.0 * np.sin(np.pi * frequencies / WINDOW)) ** 4  # gain of the second difference
+    return float(np.sqrt(np.median(power) / np.log(2.0)))  # power is distributed exponentially
 
 
 def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
@@ -109,13 +124,15 @@ def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
 
 
 def find_sensor_level(trace: Trace, signal: Signal, model: Model) -> float:
-    """RMS of a sensor's white noise: the model's, or that of the data where the plant declares none.
+    """RMS of a sensor's white noise: the model's, or that of the data where that is more or the plant declares none.
 
     And what a replay takes over of the controlled signal's noise.
     """
-    level = model.values.get(signal.noise, 0.0)
+    level, own = model.values.get(signal.noise, 0.0), floor_from_data(trace.mask_unusable(signal.name)).value
     if not signal.noise:
-        level = max(floor_from_data(trace.mask_unusable(signal.name)).value, signal.finest) or 1.0
+        level = max(own, signal.finest) or 1.0
+    elif own > NOISIER_THAN_MODEL * level:
+        level = own
     if signal == trace.declared.controlled:
         return level
     return float(np.hypot(level, compute_anchor_noise(trace, model).get(signal.name, 0.0)))

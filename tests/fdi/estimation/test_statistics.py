@@ -72,6 +72,7 @@ def test_second_differences_are_a_lower_bound() -> None:
     white, coloured = (sample_noise(5, ROWS, colour)[:, 0] / LEVELS[0] for colour in ("white", "hum"))
     assert floor_from_data(white + slow).value == pytest.approx(1.0, abs=0.05)
     assert floor_from_data(coloured + slow).value < 0.6
+    assert floor_from_data(white + 3.0 * np.sin(np.arange(ROWS) * 2.0)).value < 1.2, "a line of 318 Hz is no noise"
     assert floor_from_data(white).lower_bound and floor_from_data(np.array([1.0, 2.0])).value == 0.0
 
 
