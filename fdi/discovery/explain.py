@@ -43,7 +43,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdi.discovery.detectable import Blind, find_hidden_effects
+from fdi.discovery.detectable import WITHOUT_SIZE, Blind, find_hidden_effects
 from fdi.discovery.residual_pattern import is_periodic_in_position
 from fdi.discovery.search import FINE, Hypothesis, Search, Sensitivity
 from fdi.estimation import (
@@ -403,14 +403,17 @@ def leave_out_unneeded(search: Search, close: list[Hypothesis]) -> list[Hypothes
 
 
 def shows_effect(model: Model, h: Hypothesis, effect: str, least_sd: float = INTERVAL_95_SD) -> bool:
-    """Whether a parameter of an effect is so many standard deviations from its off value, by default those of 95 %.
+    """Whether a size of an effect is so many standard deviations from its off value, by default those of 95 %.
 
-    If none is, the fit is better only by a stop that it met by chance.
+    If none is, the fit is better only by a stop that it met by chance. A frequency or a speed at which an effect of
+    next to no size happens to help is no size.
     """
     entry = model.find_effect(effect)
     values = h.fit.values
+    sizes = [name for name in entry.fitted
+             if entry.off.get(name, 0.0) == 0.0 and entry.parameters[name].unit not in WITHOUT_SIZE]
     return any(abs(values[name] - entry.off.get(name, model.nominal.get(name, 0.0))) > least_sd * h.fit.spread(name)
-               for name in entry.fitted)
+               for name in sizes or entry.fitted)
 
 
 def sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
