@@ -41,6 +41,7 @@ from fdi.estimation import (
     replay_command,
     replay_current,
     replay_with_checked_steps,
+    require_finite_replay,
     sensor_floors,
 )
 from fdi.progress import Progress, ignore_progress
@@ -241,6 +242,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     trace = leave_out_rest(trace, model)
     repeats = [find_repeat(trace, other, model, number) for number, other in enumerate(repeats, 1)]
     progress("solver", 1 / STAGES)
+    require_finite_replay(trace, model)
     noise = sensor_floors(trace, model)
     replay = replay_with_checked_steps(trace, model, {name: f.value for name, f in noise.items()})
     progress("repeats", 2 / STAGES)

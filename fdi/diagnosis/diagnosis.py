@@ -47,6 +47,7 @@ from fdi.estimation import (
     list_relative_tolerances,
     match_period,
     prepare_trace,
+    require_finite_replay,
     sensor_floors,
 )
 from fdi.progress import Progress, ignore_progress
@@ -114,6 +115,7 @@ def diagnose(trace: Trace, model: Model | None = None, bands: Bands | None = Non
     progress("reading", 0.0)
     trace = prepare_trace(trace, model, None, source)
     model = match_period(model, trace, SAME_PERIOD)
+    require_finite_replay(trace, model)
     way = float(np.nanmax(trace.controlled) - np.nanmin(trace.controlled))
     command, controlled, least = trace.declared.command, trace.declared.controlled, MOVING_RAM * trace.scale
     if max(way, float(np.ptp(trace.command))) < least:

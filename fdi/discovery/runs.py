@@ -16,6 +16,7 @@ from fdi.estimation import (
     match_period,
     prepare_trace,
     replay_current,
+    require_finite_replay,
     sensor_floors,
 )
 from fdi.trace import Trace
@@ -52,6 +53,7 @@ def read_runs(model: Model, trace: str | Trace, repeats: Sequence[str | Trace] =
     names = [s.file for s in sources]
     est = _prepare_run(traces[0], model, signals, names[0])
     model = match_period(model, est, SAME_PERIOD)
+    require_finite_replay(est, model)
     others = tuple(_prepare_repeat(est, traces[n], model, names[n], n) for n in range(1, 1 + len(repeats)))
     unseen = None if holdout is None else _prepare_holdout(est, traces[-1], model, names[0], names[-1])
     doubt = ""

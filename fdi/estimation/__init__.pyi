@@ -99,6 +99,7 @@ from .replay import (
     replay_current as replay_current,
     replay_lanes as replay_lanes,
     replay_with_checked_steps as replay_with_checked_steps,
+    require_finite_replay as require_finite_replay,
     simulate_trace as simulate_trace,
 )
 from .unidentifiable import (

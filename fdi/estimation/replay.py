@@ -81,6 +81,18 @@ def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor
     return {name: out[0, :, i] for i, name in enumerate(trace.output_names)}
 
 
+def require_finite_replay(trace: Trace, model: Model) -> None:
+    """Refuse a model that diverges with the measured current of a prepared trace: what is no number is no error either.
+
+    Raises:
+        InputError: such a model.
+    """
+    for name, output in replay_current(trace, model, max(REPLAY_STEPS, model.steps)).items():
+        bad = np.flatnonzero(~np.isfinite(output))
+        require(not len(bad), model.name, name, f"a plant that stays finite; with the measured {trace.declared.drive.name}"
+                f" it is no finite number from t = {trace.t[bad[:1]].sum():g} s on")
+
+
 def measure_misfit(trace: Trace, model: Model) -> float:
     """How badly a replay fits the outputs of a prepared trace: the mean logarithm of their RMS residuals."""
     residuals = compute_residuals(trace, replay_current(trace, model, 20))

@@ -50,6 +50,7 @@ from fdi.estimation import (
     match_period,
     prepare_trace,
     remove_slope,
+    require_finite_replay,
     scale_noise,
     scaled_bounds,
     sensor_floors,
@@ -271,6 +272,7 @@ def read_identification_runs(model: Model, ranges: Sequence[Range], fitted_runs:
     for trace, source in zip(runs, sources, strict=True):
         require(abs(trace.period / period - 1.0) <= SAME_PERIOD, source.file, "t",
                 f"rows {period:g} s apart, as in {sources[0].file}")
+    require_finite_replay(runs[0], model)
     return IdentificationRuns(model, tuple(runs[:count]), tuple(runs[count:]), tuple(sources))
 
 
