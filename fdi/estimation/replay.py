@@ -87,10 +87,11 @@ def require_finite_replay(trace: Trace, model: Model) -> None:
     Raises:
         InputError: such a model.
     """
+    drive = trace.declared.drive.name
     for name, output in replay_current(trace, model, max(REPLAY_STEPS, model.steps)).items():
         bad = np.flatnonzero(~np.isfinite(output))
-        require(not len(bad), model.name, name, f"a plant that stays finite; with the measured {trace.declared.drive.name}"
-                f" it is no finite number from t = {trace.t[bad[:1]].sum():g} s on")
+        require(not len(bad), model.name, name, f"a plant that stays finite; with the measured {drive} it is no finite "
+                f"number from t = {trace.t[bad[:1]].sum():g} s on")
 
 
 def measure_misfit(trace: Trace, model: Model) -> float:
