@@ -324,8 +324,9 @@ def filter_signal(x: Floats, signal: int, weights: Floats, out: Floats) -> None:
             for i in range(len(weights)):
                 begin = max(i - first, 0)
                 samples = x[run, signal, first + begin - i:n]
-                for t in range(len(sums) - begin):
-                    sums[begin + t] += weights[i] * samples[t]
+                if weights[i] != 0.0:  # a signal sampled in few rows has none between them
+                    for t in range(len(sums) - begin):
+                        sums[begin + t] += weights[i] * samples[t]
             for t in range(len(sums)):
                 sums[t] = sums[t] if sums[t] == sums[t] else 0.0
 
@@ -349,7 +350,8 @@ def measure_level(difference: Floats, block: int = WINDOW) -> float:
 
 def fit_noise(residual: Floats, order: int = 40) -> Noise:
     """The autoregressive model of noise, (n,), that its length supports (Yule-Walker; Akaike's choice of order)."""
-    x = residual[~np.isnan(residual)]
+    rows = np.flatnonzero(~np.isnan(residual))
+    x = residual[rows]
     sigma = measure_level(x)
     if sigma == 0.0:
         return white_noise(float(np.finfo(float).tiny))
@@ -361,11 +363,13 @@ def fit_noise(residual: Floats, order: int = 40) -> Noise:
     covariance = np.array(pairs) / n
     covariance *= sigma**2 / covariance[0]
     best, cost = white_noise(float(np.sqrt(covariance[0]))), 0.0
+    stride = int(np.median(np.diff(rows))) if len(rows) > 1 else 1  # of a signal that is sampled in few rows
     for p in range(1, order + 1):
         a = solve_toeplitz(covariance[:p], covariance[1:p + 1])  # the equations of Yule and Walker
         variance = covariance[0] - a @ covariance[1:p + 1]
         gain = n * np.log(covariance[0] / variance) - NOISE_COEFFICIENT_GAIN * p
         if gain > cost:
-            whitener = np.concatenate([[1.0], -a])
+            whitener = np.zeros(p * stride + 1)
+            whitener[::stride] = [1.0, *-a]
             best, cost = Noise(float(np.sqrt(covariance[0])), whitener, float(np.sqrt(variance))), gain
     return best
