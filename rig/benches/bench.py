@@ -305,7 +305,7 @@ def unpack(spec: FrameSpec, data: bytes) -> dict[str, float]:
 
 
 Profile = Literal["cia402", "cia408", "none"]
-SERVICES = {0x080: "EMCY", 0x580: "SDO", 0x600: "SDO", 0x700: "heartbeat"}  # of a node: CiA 301, table of 7.3.5
+SERVICES = {0x580: "SDO", 0x600: "SDO", 0x700: "heartbeat"}  # of a node, beside EMCY: CiA 301, table of 7.3.5
 
 RIG_INPUTS = ("control_word", "mode", "cycle", "flags")  # of a controller: what the rig gives beside the plant
 RIG_OUTPUTS = ("status_word", "mode_display", "cycle")
@@ -368,6 +368,7 @@ class CanopenNode:
     settings: tuple[tuple[int, int, str], ...] = ()  # objects (index, sub) that hold a parameter of the model
     values: tuple[tuple[int, int, bytes], ...] = ()  # of a DCF: written at bring-up
     emcy: tuple[int, ...] = ()  # error codes that its manual lists
+    emcy_id: int | None = None  # identifier of its EMCY, with EXTENDED; None: it sends none
     inputs: Mapping[str, SignalObject] = field(default_factory=dict)  # signals that it receives
     outputs: Mapping[str, SignalObject] = field(default_factory=dict)  # signals that it sends
 
@@ -493,15 +494,16 @@ class Bench:
         name = next((name for name in self.files if path.as_posix().endswith(name)), path.name)
         return name, decode_device_text(self.files[name] if name in self.files else path.read_bytes())
 
-    def list_services(self) -> dict[int, str]:
+    def list_services(self) -> list[tuple[int, str]]:
         """Identifiers that carry no values of the bench, and what they are: NMT, SYNC, and the services of the nodes.
         """
-        services = {} if self.frames.sync is None else {self.frames.sync: "SYNC"}
-        if self.nodes:
-            services[0x000] = "NMT"
-            for number in (self.rig_node, *(node.node for node in self.nodes.values())):
-                services |= {base + number: f"{service} of node {number}" for base, service in SERVICES.items()}
-        return services
+        emcy_ids = {} if not self.nodes else {
+            self.rig_node: 0x080 + self.rig_node, **{node.node: node.emcy_id for node in self.nodes.values()}}
+        return [*([] if self.frames.sync is None else [(self.frames.sync, "SYNC")]),
+                *([(0x000, "NMT")] if self.nodes else []),
+                *((base + number, f"{service} of node {number}") for number in emcy_ids
+                  for base, service in SERVICES.items()),
+                *((emcy_id, f"EMCY of node {number}") for number, emcy_id in emcy_ids.items() if emcy_id is not None)]
 
 
 def decode_device_text(data: bytes) -> str:

@@ -425,7 +425,7 @@ def _map_node(reader: _Reader, keys: NodeKeys, place: Place, uses: dict[str, Use
     eds = keys.eds or ""
     dictionary = canopen_map.read_dictionary(eds, reader.read_text(keys.eds, place.at("eds"), "EDS or DCF"), keys.node)
     node = CanopenNode(node=keys.node, eds=folder / eds, values=canopen_map.list_values(dictionary),
-                       emcy=keys.emcy)
+                       emcy=keys.emcy, emcy_id=canopen_map.find_emcy(dictionary, keys.node))
     if isinstance(keys, ControllerKeys):
         _add_profile(uses, dictionary, keys, place)
         place.at("mode").require(keys.profile == "cia402" or keys.mode is None, 'profile = "cia402" with it')
@@ -545,13 +545,12 @@ def _join_frame(controller_spec: FrameSpec, plant_spec: FrameSpec, frame: Device
 
 
 def _check_identifiers(bench: Bench, place: Place) -> None:
-    """Refuse an identifier that two frames have, or a frame and a service of a node."""
-    owners = bench.list_services()
-    for spec in bench.frames.frames:
-        identifier = spec.identifier & ~FD
-        message = spec.name.partition("[")[0]  # its pages share the identifier
-        place.at("controller").require(owners.setdefault(identifier, message) == message,
-                                       f"each identifier once; {spec.name} and {owners[identifier]} have "
+    """Refuse an identifier that two frames or services of nodes have."""
+    owners: dict[int, str] = {}
+    for identifier, name in (*bench.list_services(), *(
+            (spec.identifier & ~FD, spec.name.partition("[")[0]) for spec in bench.frames.frames)):  # pages share it
+        place.at("controller").require(owners.setdefault(identifier, name) == name,
+                                       f"each identifier once; {name} and {owners[identifier]} have "
                                        f"{describe_identifier(identifier)}")
 
 

@@ -125,6 +125,12 @@ def find_sync(dictionary: Any) -> int:
     return 0x80 if word is None else _read_identifier(word)
 
 
+def find_emcy(dictionary: Any, node: int) -> int | None:
+    """The identifier of a node's EMCY, 0x80 + node-ID if the dictionary gives none; None: 0x1014 switches it off."""
+    word = read_number(dictionary, 0x1014, 0)
+    return 0x80 + node if word is None else None if word & INVALID else _read_identifier(word)
+
+
 def _read_identifier(cob_id: int) -> int:
     return cob_id & 0x1FFF_FFFF | EXTENDED if cob_id & LONG else cob_id & 0x7FF
 

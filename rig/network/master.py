@@ -45,7 +45,7 @@ from rig.network.sdo_client import CheckedSdoClient, ConfirmationError, repeat_t
 HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
 PATIENT = 10_000  # ms: the limit where the wall clock says nothing about the run, in lockstep between processes
 BOOT_TIMEOUT = 2.0  # s
-NMT, EMCY, SDO_ANSWER, HEARTBEAT_ID = 0x000, 0x080, 0x580, 0x700  # predefined connection set (CiA 301, 7.3.5)
+NMT, SDO_ANSWER, HEARTBEAT_ID = 0x000, 0x580, 0x700  # predefined connection set (CiA 301, 7.3.5)
 DEVICE_TYPE, MODE, MODE_DISPLAY = 0x1000, 0x6060, 0x6061  # objects; the modes are those of CiA 402
 
 
@@ -127,8 +127,8 @@ class Master:
         # only the rig sends them
         self._ours = identifiers | ({NMT, HEARTBEAT_ID + bench.rig_node} if bench.nodes else set())
         # What the library may see, and the only length at which that is what it seems: it unpacks without looking.
-        self._services = {base + node: length for base, length in ((EMCY, 8), (SDO_ANSWER, 8), (HEARTBEAT_ID, 1))
-                          for node in self._roles}
+        self._services = {identifier: length for node in bench.nodes.values() for identifier, length in (
+            (node.emcy_id, 8), (SDO_ANSWER + node.node, 8), (HEARTBEAT_ID + node.node, 1))}
         wire.receive = self.receive
 
     def close(self) -> None:
@@ -142,9 +142,12 @@ class Master:
 
     def _join(self, role: Role) -> Any:  # the library's node; its types are too loose to help
         name, text = self._bench.read_data_sheet(role)
-        number = self._bench.nodes[role].node
+        number, emcy_id = self._bench.nodes[role].node, self._bench.nodes[role].emcy_id
         remote = _Node(number, read_dictionary(name, text, number))
         self.network.add_node(remote)
+        self.network.unsubscribe(0x80 + number, remote.emcy.on_emcy)  # the library does not read 0x1014
+        if emcy_id is not None:
+            self.network.subscribe(emcy_id, remote.emcy.on_emcy)
         remote.emcy.add_callback(lambda error: self.hooks.on_emcy(role, error))
         remote.nmt.add_heartbeat_callback(lambda state: self._take_heartbeat(role, state))
         return remote

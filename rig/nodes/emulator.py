@@ -60,7 +60,7 @@ class PlantNode:
         self._send, self._bench = send, bench or load_bench()
         self._node = node = find_plant_node(self._bench)
         # COB-IDs of the predefined connection set (CiA 301, 7.3.3)
-        self._heartbeat, self._emcy, self._sdo = (base + node.node for base in (heartbeat.COB_ID, 0x080, 0x600))
+        self._heartbeat, self._sdo = heartbeat.COB_ID + node.node, 0x600 + node.node
         self._unheard = list_unheard(self._bench)
         self.device = Device(node.node, node.eds, self._transmit)
         self.device.on_write, self.device.on_nmt = self._on_write, self._on_nmt
@@ -151,7 +151,7 @@ class PlantNode:
 
     def _transmit(self, cob_id: int, data: bytes) -> None:
         """Send a frame of the services unless a fault or the cycle has dealt with it."""
-        if cob_id == self._emcy and self._booking:
+        if self._booking and cob_id == self._memory.words[ec.EMCY_ID]:
             return
         words, faults, is_beat = self._memory.words, self._schedule, cob_id == self._heartbeat
         if not is_beat or data == bytes(1):

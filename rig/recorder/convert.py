@@ -208,6 +208,8 @@ class _CycleBuilder:
         self._sent: int | None = None  # cycle of the command since the last SYNC
         self._recent: deque[tuple[int, Signals]] = deque(maxlen=8)  # an answer is late by a few cycles at most
         self._nmt: dict[int, int] = {}
+        self._emcy = {0x080 + node: node for node in range(1, 128)} | {
+            each.emcy_id: each.node for each in bench.nodes.values() if each.emcy_id is not None}
 
     def feed(self, frame: Frame) -> Iterable[Record]:
         """Take a frame; -> what is to be recorded besides rows."""
@@ -227,9 +229,9 @@ class _CycleBuilder:
             if node == self._plant_node and not state:  # its boot-up
                 self.plant_starts.append(len(self.rows))
             return [NmtState(node, state, name_state(state).lower())]
-        elif self._is_canopen and 0x080 < cob_id < 0x100 and len(frame.data) == 8:
+        elif self._is_canopen and cob_id in self._emcy and len(frame.data) == 8:
             code = int.from_bytes(frame.data[:2], "little")
-            return [Event("ERROR" if code else "INFO", "emcy", f"node {node}: 0x{code:04X}")]
+            return [Event("ERROR" if code else "INFO", "emcy", f"node {self._emcy[cob_id]}: 0x{code:04X}")]
         return []
 
     def _open(self, t_ns: int) -> None:

@@ -483,7 +483,7 @@ def require_possible(faults: Sequence[Fault], bench: Bench, where: str) -> None:
     """
     frames = sorted({role for spec in bench.frames.frames for role in spec.roles})
     frames += ["sync"] if bench.frames.sync is not None else []
-    identifiers = bench.list_services() | {spec.identifier: spec.name for spec in bench.frames.frames}
+    identifiers = dict(bench.list_services()) | {spec.identifier: spec.name for spec in bench.frames.frames}
     for i, fault in enumerate(faults):
         match fault:
             case Frames() if fault.frame not in frames:

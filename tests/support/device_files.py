@@ -49,8 +49,9 @@ def format_eds(objects: Mapping[str, Entry], rpdos: Sequence[Mapped] = (), tpdos
     return "".join(parts)
 
 
-OBJECTS = {"2000": Entry(4), "2001": Entry(8), "2002": Entry(3, "ro"), "2003": Entry(5), "2004sub0": Entry(5, "const"),
-           "2004sub1": Entry(6), "2005": Entry(9, "ro"), "2006": Entry(9), "6040": Entry(6), "6041": Entry(6, "ro")}
+OBJECTS = {"1014": Entry(7, "const", "0xBA"), "2000": Entry(4), "2001": Entry(8), "2002": Entry(3, "ro"),
+           "2003": Entry(5), "2004sub0": Entry(5, "const"), "2004sub1": Entry(6), "2005": Entry(9, "ro"),
+           "2006": Entry(9), "6040": Entry(6), "6041": Entry(6, "ro")}
 RPDOS = (Mapped((0x2000_0020, 0x6040_0010), "$NODEID+0x200"), Mapped((0x2001_0020,), "$NODEID+0x300", 255))
 TPDOS = (Mapped((0x2002_0010, 0x6041_0010), "$NODEID+0x180"),)
 BENCH = """name = "a drive"

@@ -192,6 +192,7 @@ SHEETS = [
     ((RPDOS[0]._replace(cob_id="0x80000205"), RPDOS[1]), TPDOS, "RPDO1 maps 0x2000, but is switched off (bit 31 of 0"),
     ((RPDOS[0]._replace(cob_id="0x305"), RPDOS[1]), TPDOS, "expected each identifier once; RPDO2 and RPDO1 have 0x305"),
     ((RPDOS[0]._replace(cob_id="0x80"), RPDOS[1]), TPDOS, "expected each identifier once; RPDO1 and SYNC have 0x080"),
+    (RPDOS, (TPDOS[0]._replace(cob_id="0xBA"),), "each identifier once; TPDO1 and EMCY of node 5 have 0x0BA"),
     ((RPDOS[0]._replace(words=(*RPDOS[0].words, 0x2004_0110, 0x0005_0008)), RPDOS[1]), TPDOS,
      "x.eds: 0x1600: expected at most 8 bytes in RPDO1, not 72 bits"),
     ((RPDOS[0]._replace(kind=250), RPDOS[1]), TPDOS, "a transmission type 0 to 240, 254 or 255 for RPDO1, not 250"),

@@ -12,7 +12,7 @@ import pytest
 from device_files import BENCH, OBJECTS, RPDOS, TPDOS, Entry, Mapped, format_eds, write_bench
 from refusals import catch_refusal
 
-from rig.benches import Role, load_bench
+from rig.benches import EXTENDED, Role, load_bench
 from rig.network import BusError, EmbeddedWire, Frame, Master, NmtState, Send, VirtualClock
 
 IDENTITY = {"1000": Entry(7, "ro", "0x20192"), "1018sub0": Entry(5, "const", "2"), "1018sub1": Entry(7, "ro", "0x77"),
@@ -131,6 +131,15 @@ def test_a_fixed_heartbeat_is_watched_by_its_own_period(tmp_path: Path) -> None:
     place.master.start()
     assert place.master.wait_for_operational(2.0).keys() == {Role.CONTROLLER}
     assert place.master.find_silent(2.0) == [] and not losses
+
+
+@pytest.mark.parametrize(("word", "count"), [
+    ("0xBA", 2), ("0x200000BA", 3), ("0x800000BA", 0), ("$NODEID+0x80", 1), ("", 1)])
+def test_an_emcy_has_the_identifier_of_0x1014(word: str, count: int, tmp_path: Path) -> None:
+    master = Place(tmp_path, {**ALL, "1014": Entry(7, "const", word)}).master
+    for cob_id in (0x085, *2 * (0x0BA,), *3 * (EXTENDED | 0x0BA,)):
+        master.receive(Frame(0, cob_id, bytes(8)))
+    assert master.count_emergencies(Role.CONTROLLER) == count
 
 
 def test_the_mode_of_a_drive_is_set_and_read_back(tmp_path: Path) -> None:

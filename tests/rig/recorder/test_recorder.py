@@ -25,7 +25,7 @@ from synthetic_run import ATTACHMENTS, METADATA, build_cycles, record_run
 
 from fdi.trace import Trace, open_log
 from plant import InputError
-from rig.benches import EXTENDED, FD, SWITCHED, load_bench
+from rig.benches import EXTENDED, FD, SWITCHED, load_bench, load_bench_from_files
 from rig.network import Frame, make_message
 from rig.network.frame import FD_LENGTHS
 from rig.recorder import U32, CanFrame, Event, NmtState, Recorder, RecorderError
@@ -371,10 +371,12 @@ CANDUMP = """\
 """
 
 
-@pytest.mark.parametrize("faster", [1, 4])
-def test_lost_and_late_frames_of_a_candump(faster: int, tmp_path: Path) -> None:
-    text = re.sub(r"\.(\d+)", lambda match: f".{int(match[1]) // faster:06}", CANDUMP)
-    assert import_frames(write_file(tmp_path / "x.log", text), tmp_path / "x.mcap", load_bench()) == 5
+@pytest.mark.parametrize(("faster", "emcy"), [(1, "083"), (4, "0BA")])
+def test_lost_and_late_frames_of_a_candump(faster: int, emcy: str, tmp_path: Path) -> None:
+    text = re.sub(r"\.(\d+)", lambda match: f".{int(match[1]) // faster:06}", CANDUMP).replace("083#", f"{emcy}#")
+    bench = load_bench_from_files({name: data.replace(b"$NODEID+0x80", f"0x{emcy}".encode()) if name == "node3.eds"
+                                   else data for name, data in load_bench().files.items()})
+    assert import_frames(write_file(tmp_path / "x.log", text), tmp_path / "x.mcap", bench) == 5
     trace = Trace.read(tmp_path / "x.mcap")
     assert trace.period == 1e-3 / faster and len(trace) == 7 and [g.cycles for g in trace.gaps] == [2]
     np.testing.assert_allclose([trace.cor, trace.com], [[1e-5, 1e-5, 1e-5, np.nan, np.nan, np.nan, 1e-5],
