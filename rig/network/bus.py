@@ -218,7 +218,7 @@ class Link:
         self._latest = 0  # ns: a frame came no earlier than the one before, even if somebody has set the clock since
         self._socket: socket.socket | None = None
         self._left_out: frozenset[int] = frozenset()
-        self._foreign = 0  # bits of a COB-ID that a frame must not have
+        self._selection: frozenset[int] | None = None  # the COB-IDs that are received; None: all
         if isinstance(bus, SocketcanBus):
             self._socket = bus.socket
             set_receive_options(self._socket)
@@ -266,22 +266,22 @@ class Link:
         self._left_out = frozenset(cob_ids)
         self._set_filters()
 
-    def select_nodes(self, most: int | None) -> None:
-        """Receive only the frames of CANopen nodes 0 to `most`, a power of two less one; None: all frames.
+    def select_frames(self, cob_ids: Collection[int] | None) -> None:
+        """Receive only the frames with these COB-IDs; None: all frames.
 
         On socketcan the kernel drops the others, so that their number does not matter.
         """
-        self._foreign = 0 if most is None else EXTENDED | 0x7F & ~most
+        self._selection = None if cob_ids is None else frozenset(cob_ids)
         self._set_filters()
 
     def _set_filters(self) -> None:
         if isinstance(self._bus, UdpBus):
             self._bus.leave_out(sorted(self._left_out))
         elif self._socket is not None:
-            exact = IDENTIFIER | EXTENDED | socket.CAN_RTR_FLAG
-            filters = [*(_FILTER.pack(cob_id & ~FD | _INVERTED, exact) for cob_id in sorted(self._left_out)),
-                       *([_FILTER.pack(0, self._foreign)] if self._foreign else [])]
-            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_JOIN_FILTERS, int(bool(filters)))
+            exact, is_open = IDENTIFIER | EXTENDED | socket.CAN_RTR_FLAG, self._selection is None
+            cob_ids = self._left_out if self._selection is None else self._selection - self._left_out
+            filters = [_FILTER.pack(cob_id & ~FD | _INVERTED * is_open, exact) for cob_id in sorted(cob_ids)]
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_JOIN_FILTERS, int(is_open and bool(filters)))
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"".join(filters) or _FILTER.pack(0, 0))
 
     def close(self) -> None:
@@ -298,7 +298,7 @@ class Link:
                 self.dropped += 1
             elif not has_valid_length(cob_id, len(message.data)):
                 self.error_frames += 1
-            elif cob_id not in self._left_out and not cob_id & self._foreign:
+            elif cob_id not in self._left_out and (self._selection is None or cob_id in self._selection):
                 yield Frame(self._clock(), cob_id, bytes(message.data))
             message = self._bus.recv(0)
 
@@ -466,7 +466,7 @@ class LinkWire(Wire):
 
     def hear_all(self) -> None:
         """See `Wire`."""
-        self.link.select_nodes(None)
+        self.link.select_frames(None)
 
     def close(self) -> None:
         """See `Wire`."""

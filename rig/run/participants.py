@@ -72,9 +72,8 @@ def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
     clock = WallClock()
     timeout = LOST_FRAME_TIMEOUT if job.sequence.loses_frames else FRAME_TIMEOUT
     link_wire = LinkWire(Link(open_can(job.bus, job.bench.bitrate, job.bench.frames.is_fd), clock.now), clock, timeout)
-    if numbers := [job.bench.find_number(role) for role in (RIG, *job.bench.nodes)] if job.bench.nodes else []:
-        # until bring-up is over: boot-ups must not be lost among the frames of others
-        link_wire.link.select_nodes((1 << max(numbers).bit_length()) - 1)
+    if job.bench.nodes:  # until bring-up is over: boot-ups must not be lost among the frames of others
+        link_wire.link.select_frames([*job.bench.frames.by_identifier, *dict(job.bench.list_services())])
     processes = NodeProcesses()
     try:
         _start_missing_nodes(job, Master(link_wire, clock.now, False, job.bench), processes)

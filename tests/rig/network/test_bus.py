@@ -153,13 +153,14 @@ class TestLink:
                     assert echo.equals(message, timestamp_delta=None, check_channel=False, check_direction=False)
 
     @links
-    def test_nodes_are_selected_by_classical_frames(self, bus_kind: str) -> None:
+    def test_frames_are_selected(self, bus_kind: str) -> None:
         with stations(bus_kind, 2) as (sender, receiver):
-            receiver.select_nodes(3)
-            for cob_id in (0x183, 0x184, EXTENDED | 0x183, 0x080):
+            receiver.select_frames((0x1F3, EXTENDED | 0x12345, 0x080, 0x182))
+            receiver.leave_out((0x182,))
+            for cob_id in (0x1F3, 0x184, EXTENDED | 0x1F3, 0x182, EXTENDED | 0x12345, 0x080):
                 sender.send(cob_id, b"")
-            assert [frame.cob_id for frame in gather(receiver, 2)] == [0x183, 0x080]
-            receiver.select_nodes(None)
+            assert [frame.cob_id for frame in gather(receiver, 3)] == [0x1F3, EXTENDED | 0x12345, 0x080]
+            receiver.select_frames(None)
             sender.send(EXTENDED | 0x183, b"")
             assert [frame.cob_id for frame in gather(receiver, 1)] == [EXTENDED | 0x183]
 

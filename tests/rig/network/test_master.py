@@ -43,7 +43,7 @@ def served(where: str, *makers: type[Emulator] | type[Firmware]) -> Iterator[Non
     threads = [threading.Thread(target=serve_node, args=(make(link.send), link, clock, over.is_set))
                for make, link in zip(makers, links, strict=True)]
     for link, thread in zip(links, threads, strict=True):
-        link.select_nodes(3)
+        link.select_frames([*load_bench().frames.by_identifier, *dict(load_bench().list_services())])
         thread.start()
     try:
         yield

@@ -109,13 +109,16 @@ def start_event_driven(folder: Path, where: str) -> PythonDevice:
 
 
 def start_synchronous(folder: Path, where: str) -> PythonDevice:
-    """INTEGER16 and INTEGER32 in synchronous RPDOs, beside an object that the bench does not use; node 1."""
+    """INTEGER16 and INTEGER32 in synchronous RPDOs, beside an object that the bench does not use; node 1.
+
+    The COB-ID of its TPDO is in the range of another node.
+    """
     return start_canopen(
         folder, where, 1, (3, 4, 3), [Mapped((0x2003_0010, 0x2000_0010), "$NODEID+0x200", 1),
                                       Mapped((0x2001_0020,), "$NODEID+0x300", 0)],
-        [Mapped((0x2002_0010,), "$NODEID+0x180", 1)], "0.5 um", "1 uA",
+        [Mapped((0x2002_0010,), "0x1F3", 1)], "0.5 um", "1 uA",
         inputs={0x201: ("<hh", {"unused": 1.0, "position_demand": 0.5e-6}), 0x301: ("<i", {"ram_position": 0.5e-6})},
-        output=(0x181, "<h", 1e-6))
+        output=(0x1F3, "<h", 1e-6))
 
 
 def start_every_second(folder: Path, where: str) -> PythonDevice:
