@@ -81,6 +81,12 @@ class Field:
         return (-half, half - 1) if self.kind is Kind.SIGNED else (0, 2 * half - 1)
 
     @property
+    def ends(self) -> tuple[float, float]:
+        """Smallest and largest value of an integer, SI."""
+        low, high = sorted(map(self.compute_value, self.range))
+        return low, high
+
+    @property
     def modulus(self) -> int:
         """How many values a counter has: after the last comes 0."""
         return self.wrap or 1 << self.length
@@ -411,6 +417,14 @@ class Bench:
         """The size of the value nearest to 0 that a signal can have, SI: of one with an offset up to half a count."""
         return max((min(abs(each.decode(each.encode(0.0))), 0.5 * float(abs(each.count))) for spec in self.frames.frames
                     for each in spec.fields if each.name == word), default=0.0)
+
+    def list_ranges(self, *roles: str) -> list[tuple[str, str, float, float]]:
+        """Frame, signal, smallest and largest value, SI, where the frames to the controller have integers for signals
+        of these roles.
+        """
+        names = {s.word: s.name for s in self.signals if s.role in roles}
+        return [(spec.name, names[each.name], *each.ends) for spec in self.frames.list_from(Role.RIG, Role.PLANT)
+                for each in spec.fields if each.name in names and each.kind is not Kind.FLOAT]
 
     def replace_signals(self, signals: Signals, noise: float, model: str) -> Self:
         """The bench with the plant of another model: its signals, and the noise of the controlled one's sensor.

@@ -8,6 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
+
 from fdi.foreign_code import (
     Announce,
     ForeignCode,
@@ -68,7 +70,7 @@ class Job(RunSettings):
     The sequence is sampled at the rate of the bench, whose cycle is the period of the model's controller.
 
     Raises InputError for a controller of ours on the bench of another device, for a sequence that cannot be sampled at
-    this rate, and for faults that the bench cannot have.
+    this rate, and for demands and faults that the bench cannot have.
     """
 
     sequence: Sequence
@@ -92,6 +94,18 @@ class Job(RunSettings):
                 f"external: our own firmware does not speak as the device of {self.bench.name!r}")
         object.__setattr__(self, "sequence", self.sequence.at_rate(self.bench.rate))
         object.__setattr__(self, "model", self.model.replace({"controller.period": self.period_ns / 1e9}))
+        self._require_range()
+
+    def _require_range(self) -> None:
+        """Refuse a demand that its frame cannot hold: the frame would carry another one than the checks judge."""
+        signal = self.bench.signals.command
+        margin = 0.5 * self.bench.find_count(signal.word)  # a demand is rounded
+        for frame, _, low, high in self.bench.list_ranges("command"):
+            for key, demands in self.sequence.list_demands():
+                worst = demands[np.argmax(np.abs(demands - 0.5 * (low + high)))]
+                require(low - margin <= worst <= high + margin, self.sequence.name, key,
+                        f"demands from {low:g} to {high:g} {signal.unit}, which frame {frame} of {self.bench.name!r} "
+                        f"can hold, not {worst:g}")
 
     @property
     def realtime(self) -> bool:

@@ -27,7 +27,7 @@ from plant import (
     make_columns_type,
     report_system_error,
 )
-from rig.benches import Flags, Role
+from rig.benches import Bench, Flags, Role
 from rig.network import NAMES, PLANT, CycleRecord, Identity, WallClock
 from rig.recorder import Observer, Recorder, collect_provenance, read_epoch_ns
 from rig.run.attribution import Attribution, Cause, CycleRecords, attribute, count_most_in_a_row, find_injected
@@ -62,18 +62,20 @@ INTERRUPTED = 130
 
 
 class LimitReached(NamedTuple):
-    """A limit that a run reached."""
+    """A limit that a run reached: of the model, on either side of zero, or an end of what a frame can hold."""
 
-    parameter: str  # of the model: the limit
+    parameter: str  # of the model: the limit; "" of a frame
     signal: str
-    limit: float  # SI; reached on either side of zero
+    limit: float  # SI
     t: float  # s of main, when it was reached first
     seconds: float  # how long the signal was there, in all
+    frame: str = ""  # in which the signal may have been cut off
 
     def describe(self, signals: Signals) -> str:
         """The limit in words, such as "ram at its stop (40 mm) for 120 ms, first at t = 1.250 s"."""
         signal = signals.find(self.signal)
-        words = f"{signal.phrase} at its {'limit' if signal.role == 'drive' else 'stop'}"
+        words = f"{signal.phrase} at " + (f"the end of its range in frame {self.frame}" if self.frame else
+                                          "its limit" if signal.role == "drive" else "its stop")
         unit_signal = signals.controlled if signal.unit == signals.controlled.unit else signal
         return (f"{words} ({unit_signal.shown_scale * self.limit:.3g} {unit_signal.shown_unit}) for "
                 f"{1e3 * self.seconds:.0f} ms, first at t = {self.t:.3f} s")
@@ -115,7 +117,7 @@ class Outcome:
             return "ABORTED"
         if self.failures:
             return "FAIL"
-        if self._list_checks("CANNOT_TELL"):
+        if self._list_checks("CANNOT_TELL") or self.cut_off:
             return "CANNOT_TELL"
         # Whether anything says what the actuator should do: a check, the end of the sequence, or `rig fdi`.
         sequence = self.job.sequence
@@ -129,6 +131,13 @@ class Outcome:
         return [*(check.name for check in self._list_checks("FAIL")),
                 *(["the run did not end in the safe state"] if is_unsafe else []),
                 *([f"rig fdi: {self.fdi['sentence'].rstrip('.')}"] if has_fault(self.fdi) else [])]
+
+    @property
+    def cut_off(self) -> list[str]:
+        """Signals that their frames cut off, in words, but those that a fault of the sequence changes."""
+        changed = {getattr(fault, "signal", "") for fault in self.job.sequence.faults}
+        return [each.describe(self.job.bench.signals) for each in self.limits
+                if each.frame and each.signal not in changed]
 
     def _list_checks(self, verdict: str) -> list[CheckResult]:
         return [check for check in self.checks if check.verdict == verdict]
@@ -217,7 +226,7 @@ class Outcome:
         words = {"NOT_JUDGED": f"the sequence has no checks; {pass_count} protocol checks passed",
                  "FAIL": "; ".join(self.failures), "INVALID_TIMING": self.timing_problem,
                  "CANNOT_TELL": "too uncertain for a verdict: " + "; ".join(
-                     check.name for check in self._list_checks("CANNOT_TELL")),
+                     [*(check.name for check in self._list_checks("CANNOT_TELL")), *self.cut_off]),
                  "ABORTED": self.describe_cause() or self.aborted}
         reason, problems = words.get(self.verdict, ""), list(self.metrology.problems.values())
         return "; ".join([reason or "every check passed", *problems] if problems else [reason])
@@ -309,27 +318,33 @@ def summarise_timing(history: History, loop: Loop, scheduler: str, kind: str, re
 NEAR_A_STOP = 5.0  # standard deviations of the sensor's noise from a stop within which a reading is at it
 
 
-def find_limits(column: Callable[[str], Array], model: Model, zero: int) -> tuple[LimitReached, ...]:
+def find_limits(column: Callable[[str], Array], model: Model, bench: Bench, zero: int) -> tuple[LimitReached, ...]:
     """The limits that the signals of a run reached.
 
     Args:
         column: gives a signal of all cycles, SI; NaN for missing samples.
         model: its travels, current limit, cycle and sensor noise.
+        bench: its frames, which cut off what they cannot hold.
         zero: the cycle in which main starts.
     """
     signals = model.kind.signals
     positions = [s for s in signals.outputs if s.unit == signals.controlled.unit]
     period, limits = model["controller.period"], []
+    bounds = []  # parameter, signal, limit, frame, values at and below which and at and above which it is reached
     for signal in (*positions, signals.drive):
         limit = model.values.get(signal.limit)
         if limit is None:  # the plant declares none
             continue
         two_counts = 2.5e-6 * limit  # of the drive frame
         margin = two_counts if signal.role == "drive" else NEAR_A_STOP * model.values.get(signal.noise, 0.0)
-        rows = np.flatnonzero(np.abs(column(signal.name)) >= limit - margin)
-        if len(rows):
-            limits.append(LimitReached(signal.limit, signal.name, limit, (int(rows[0]) - zero) * period,
-                                       len(rows) * period))
+        bounds.append((signal.limit, signal.name, limit, "", margin - limit, limit - margin))
+    for frame, name, low, high in bench.list_ranges("output", "load"):
+        bounds += [("", name, low, frame, low, np.inf), ("", name, high, frame, -np.inf, high)]
+    for parameter, name, limit, frame, low, high in bounds:
+        rows = np.flatnonzero((column(name) <= low) | (column(name) >= high))
+        if len(rows) and limit:  # an unsigned number is also 0 at rest
+            limits.append(LimitReached(parameter, name, limit, (int(rows[0]) - zero) * period, len(rows) * period,
+                                       frame))
     return tuple(limits)
 
 
@@ -460,7 +475,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
         attribution=attribution, timing=summarise_timing(history, loop, scheduler, kind, reason),
         counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / seconds,
         start_times=starter.start_times, identities=starter.identities, metrology=metrology, started_ns=started_ns,
-        limits=find_limits(history.column, job.model, job.scenario.plan.start))
+        limits=find_limits(history.column, job.model, job.bench, job.scenario.plan.start))
     fdi, cause = outcome.fdi, attribution.cause
     notes: dict[str, dict[str, str]] = {
         "not_applicable": {check.name: check.reason for check in skipped_checks},

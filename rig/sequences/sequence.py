@@ -8,7 +8,7 @@ test of a plant is the profile that it declares, or the main phase of preflight.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
@@ -165,6 +165,15 @@ class Sequence:
     def cleanup_profile(self, start: float) -> Profile:
         """The command after main, or after it was broken off at the demand `start`, SI."""
         return build_profile(self.cleanup, start, self.rate)
+
+    def list_demands(self) -> Iterator[tuple[str, Array]]:
+        """Key of each segment of the command, such as "main[1]", and its demands, SI; the last of a phase with its end.
+        """
+        end = 0.0
+        for phase in PHASES[:-1]:
+            values, sections, end = build_profile(getattr(self, phase), end, self.rate)
+            for i, section in enumerate(sections):
+                yield f"{phase}[{i}]", np.append(values, end)[section.start:section.stop + (i == len(sections) - 1)]
 
     def sections(self) -> dict[str, slice]:
         """Rows of main by section name, as checks see them."""

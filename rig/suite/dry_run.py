@@ -116,7 +116,8 @@ class DryRun(NamedTuple):
         return [*(f"{each.name} {each.describe(each.value)} beyond {each.describe(each.limit)} ({each.parameter}) in "
                   f"{each.section!r}, t = {each.t:.3f} s"
                   for each in self.demands if each.limit is not None and each.is_violated),
-                *(each.describe(signals) for each in self.limits if each.signal == signals.controlled.name),
+                *(each.describe(signals) for each in self.limits
+                  if each.frame or each.signal == signals.controlled.name),
                 *(f"guard {name!r} violated at t = {t:.3f} s" for name, t in self.trips),
                 *(f"check {check.name!r}: {check.detail}" for check in self.checks if check.value != check.value)]
 
@@ -152,7 +153,7 @@ def make_dry_run(job: Job) -> DryRun:
     return DryRun(
         job=job, durations={phase: len(profile.command) / rate for phase, profile in phases.items()},
         demands=measure_demands(command, load, t, name_rows(phases), model, rate), faults=faults, predicted=trace,
-        limits=find_limits(lambda name: getattr(prediction, name), model, first), checks=checks,
+        limits=find_limits(lambda name: getattr(prediction, name), model, job.bench, first), checks=checks,
         not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],
         trips=[] if sequence.faults else [*find_trips(sequence.guards, run)])
 

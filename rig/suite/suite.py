@@ -518,7 +518,8 @@ def _make_run_test(result: CaseResult, classname: str) -> junit.TestCase:
         return test._replace(problem="failure", detail=result.verdict)
     if result.verdict in ("INVALID_TIMING", "ERROR"):
         return test._replace(problem="error", detail=result.verdict)
-    if result.verdict in ("NOT_JUDGED", "NOT_RUN"):
+    is_cut_off = result.verdict == "CANNOT_TELL" and not any(check.cannot_tell for check in result.checks)
+    if is_cut_off or result.verdict in ("NOT_JUDGED", "NOT_RUN"):
         return test._replace(problem="skipped", message=f"{result.verdict}: {result.why}")
     return test
 

@@ -50,6 +50,8 @@ def test_a_sequence_is_checked_together_with_a_bench(tmp_path: Path) -> None:
     assert answer["bench"]["protocol"] == "can" and answer["demands"]
     assert "expected a SEQUENCE, --bench FILE, or both" in refuse("check")
     assert "a file that can be read" in refuse("check", "--bench", tmp_path / "none.toml")
+    assert "main[1]: expected demands from -0.00214748 to 0.00214748 m, which frame RPDO1 of 'a drive' can" in refuse(
+        "check", "preflight", "--bench", write_bench(tmp_path, BENCH.replace('"1 um"', '"0.001 nm"')))
 
 
 @pytest.mark.parametrize("name", SHEETS)

@@ -1,6 +1,7 @@
 """No false green: a run without checks is not judged, limits and faults are reported, and so is what is not nominal."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from fdi.diagnosis.diagnosis import diagnose
 from fdi.report import build_run_report, format_report
 from fdi.trace import Trace
 from plant import load_model
-from rig.run import Outcome, find_limits, run_job
+from rig.benches import load_bench
+from rig.run import LimitReached, Outcome, find_limits, run_job
 
 UNCHECKED = SHORT.partition("checks = [")[0]
 TO_THE_STOP = """
@@ -31,7 +33,10 @@ def test_without_checks_nothing_passed(tmp_path: Path) -> None:
     assert build_answer(outcome)["verdict"] == "NOT_JUDGED"
     report = build_run_report(Trace.read(tmp_path, all=True))
     assert (report.verdict, report.mood) == ("NOT_JUDGED", "doubtful") and "every check" not in report.sentence.lower()
-    assert play(job(SHORT), tmp_path).verdict == "PASS"
+    outcome = play(job(SHORT), tmp_path)
+    assert outcome.verdict == "PASS"
+    cut_off = replace(outcome, limits=[LimitReached("", "xj", 0.04, 0.1, 0.2, "RPDO2")])
+    assert (cut_off.verdict, cut_off.status) == ("CANNOT_TELL", 1) and "ram at the end of its range in" in cut_off.why
 
 
 def test_the_ram_at_its_stop_and_the_current_at_its_limit_are_reported(tmp_path: Path) -> None:
@@ -50,11 +55,14 @@ def test_the_ram_at_its_stop_and_the_current_at_its_limit_are_reported(tmp_path:
 
 def test_a_signal_just_inside_its_limit_is_not_reported() -> None:
     model = load_model()
-    columns = {"xj": np.array([0.0399, np.nan]), "xs": np.array([-1.24e-3, 0.0]), "cor": np.array([7.9999e-3, 0.0])}
-    assert find_limits(columns.__getitem__, model, 0) == ()
+    columns = {"xj": np.array([0.0399, np.nan]), "xs": np.array([-1.24e-3, 0.0]), "cor": np.array([7.9999e-3, 0.0]),
+               "p12": np.array([0.0, 2.0e10])}
+    assert find_limits(columns.__getitem__, model, load_bench(), 0) == ()
     columns["cor"][1] = -8e-3
-    (limit,) = find_limits(columns.__getitem__, model, 1)
-    assert (limit.signal, limit.t, limit.seconds) == ("cor", 0.0, 1e-3)
+    columns["p12"][1] = -10.0 * 2**31
+    assert [(limit.signal, limit.limit, limit.frame, limit.t, limit.seconds) for limit in find_limits(
+        columns.__getitem__, model, load_bench(), 1)] == [
+            ("cor", 8e-3, "", 0.0, 1e-3), ("p12", -10.0 * 2**31, "RPDO2", 0.0, 1e-3)]
 
 
 STEPS = """

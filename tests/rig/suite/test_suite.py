@@ -326,6 +326,7 @@ def test_junit_has_the_diagnosis_as_a_test_of_its_own(units: tuple[Path, Command
     ("FAIL", "ACCEPTABLE", [False], ["", "failure", ""], "because"),
     ("FAIL", "ACCEPTABLE", [True], ["failure", "", ""], "because"),  # it did not end as the sequence says
     ("PASS", "CANNOT_TELL", [True], ["", "", "skipped"], "rig fdi cannot tell"),
+    ("CANNOT_TELL", "ACCEPTABLE", [True], ["skipped", "", ""], "because"),  # a frame cut a signal off
     ("INVALID_TIMING", "SOMETHING_ELSE", [True], ["error", "", "skipped"], "because")])
 def test_what_the_diagnosis_means_for_the_case(verdict: str, word: str, passes: list[bool], problems: list[str],
                                                reason: str, tmp_path: Path) -> None:
