@@ -164,7 +164,8 @@ class DriveFrames(NamedTuple):
     def select_between(self, t0: float, t1: float) -> Self:
         """Those with t0 <= t < t1."""
         is_within = (self.t >= t0 - 1e-9) & (self.t < t1 - 1e-9)  # times come from ns
-        return self._replace(t=self.t[is_within], current=self.current[is_within], status=self.status[is_within])
+        return self._replace(t=np.maximum(self.t[is_within], t0), current=self.current[is_within],
+                             status=self.status[is_within])
 
     @property
     def states(self) -> NDArray[np.int64]:

@@ -213,6 +213,7 @@ LEFT = (Event(0.51, "nmt", "node 2 controller left OPERATIONAL: boot-up"),)
     ("shut_off", {"after": 0.5, "events": LEFT}, ((0.5, ON, 15), (0.505, ON, 15)), 0.01),
     ("shut_off", {"after": 0.5, "events": LEFT}, ((0.5, ON, 15), (0.52, ON, 15)), None),
     ("recovers", {}, ((0.9, ON, 15), (1.0, OFF, 0), (1.001, OFF, 8), (1.002, ON, 15), (1.003, ON, 15)), 0.002),
+    ("recovers", {}, ((1.0 - 1e-9, ON, 15), (1.001, ON, 15)), 0.0),  # times come from ns
     ("recovers", {}, ((1.0, ON, 15), (1.2, OFF, 0)), None), ("recovers", {}, ((0.9, ON, 15),), None),
 ])
 def test_time_until_the_controller_is_off_or_active_again(kind: str, keys: dict[str, Any], frames: Drives,
