@@ -416,7 +416,8 @@ def test_the_answers_of_runs(preflight: Path, aborted: Path) -> None:
     answers[1]["consequences"] = [{"t": 0.0, "source": "node 2 controller", "kind": "stopped", "text": "silent"}]
     answers[1]["fdi"] = {"verdict": "CANNOT_TELL", "sentence": "not judged: too short"}
     answers[1]["judged"]["lateness"] = [{"t": 0.0, "cycle": 1, "last": 1, "source": "rig", "text": "late"}]
-    answers[1]["limits"] = [{"parameter": "p", "signal": "xj", "limit": 1.0, "t": 0.0, "seconds": 1.0}]
+    answers[1]["limits"] = [{"parameter": "p", "signal": "xj", "limit": 1.0, "t": 0.0, "seconds": 1.0,
+                             "frame": ""}]
     answers[1]["calibration"] = {"xj": {
         "signal": "xj", "unit": "m", "identifier": "K-118", "date": "2026-03-01", "expiry": "2027-03-01", "u": 1e-6,
         "distribution": "normal", "gain": 0.0, "noise": 0.0, "problem": ""}}

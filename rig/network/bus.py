@@ -279,8 +279,8 @@ class Link:
             self._bus.leave_out(sorted(self._left_out))
         elif self._socket is not None:
             exact, is_open = IDENTIFIER | EXTENDED | socket.CAN_RTR_FLAG, self._selection is None
-            cob_ids = self._left_out if self._selection is None else self._selection - self._left_out
-            filters = [_FILTER.pack(cob_id & ~FD | _INVERTED * is_open, exact) for cob_id in sorted(cob_ids)]
+            filters = [_FILTER.pack(cob_id & ~FD | _INVERTED * is_open, exact) for cob_id in sorted(
+                self._left_out if self._selection is None else self._selection - self._left_out)]
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_JOIN_FILTERS, int(is_open and bool(filters)))
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"".join(filters) or _FILTER.pack(0, 0))
 

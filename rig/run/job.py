@@ -8,8 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import numpy as np
-
 from fdi.foreign_code import (
     Announce,
     ForeignCode,
@@ -101,11 +99,11 @@ class Job(RunSettings):
         signal = self.bench.signals.command
         margin = 0.5 * self.bench.find_count(signal.word)  # a demand is rounded
         for frame, _, low, high in self.bench.list_ranges("command"):
-            for key, demands in self.sequence.list_demands():
-                worst = demands[np.argmax(np.abs(demands - 0.5 * (low + high)))]
-                require(low - margin <= worst <= high + margin, self.sequence.name, key,
-                        f"demands from {low:g} to {high:g} {signal.unit}, which frame {frame} of {self.bench.name!r} "
-                        f"can hold, not {worst:g}")
+            for phase in ("setup", "main", "cleanup"):
+                for i, demands in enumerate(self.sequence.split_phase(phase)):
+                    require(low - margin <= demands.min() and demands.max() <= high + margin, self.sequence.name,
+                            f"{phase}[{i}]", f"demands from {low:g} to {high:g} {signal.unit}, which frame {frame} of "
+                            f"{self.bench.name!r} can hold, not from {demands.min():g} to {demands.max():g}")
 
     @property
     def realtime(self) -> bool:

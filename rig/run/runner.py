@@ -135,9 +135,8 @@ class Outcome:
     @property
     def cut_off(self) -> list[str]:
         """Signals that their frames cut off, in words, but those that a fault of the sequence changes."""
-        changed = {getattr(fault, "signal", "") for fault in self.job.sequence.faults}
-        return [each.describe(self.job.bench.signals) for each in self.limits
-                if each.frame and each.signal not in changed]
+        return [each.describe(self.job.bench.signals) for each in self.limits if each.frame and each.signal not in {
+            getattr(fault, "signal", "") for fault in self.job.sequence.faults}]
 
     def _list_checks(self, verdict: str) -> list[CheckResult]:
         return [check for check in self.checks if check.verdict == verdict]
@@ -327,25 +326,19 @@ def find_limits(column: Callable[[str], Array], model: Model, bench: Bench, zero
         bench: its frames, which cut off what they cannot hold.
         zero: the cycle in which main starts.
     """
-    signals = model.kind.signals
-    positions = [s for s in signals.outputs if s.unit == signals.controlled.unit]
-    period, limits = model["controller.period"], []
-    bounds = []  # parameter, signal, limit, frame, values at and below which and at and above which it is reached
-    for signal in (*positions, signals.drive):
-        limit = model.values.get(signal.limit)
-        if limit is None:  # the plant declares none
-            continue
-        two_counts = 2.5e-6 * limit  # of the drive frame
-        margin = two_counts if signal.role == "drive" else NEAR_A_STOP * model.values.get(signal.noise, 0.0)
-        bounds.append((signal.limit, signal.name, limit, "", margin - limit, limit - margin))
-    for frame, name, low, high in bench.list_ranges("output", "load"):
-        bounds += [("", name, low, frame, low, np.inf), ("", name, high, frame, -np.inf, high)]
-    for parameter, name, limit, frame, low, high in bounds:
-        rows = np.flatnonzero((column(name) <= low) | (column(name) >= high))
-        if len(rows) and limit:  # an unsigned number is also 0 at rest
-            limits.append(LimitReached(parameter, name, limit, (int(rows[0]) - zero) * period, len(rows) * period,
-                                       frame))
-    return tuple(limits)
+    signals, period = model.kind.signals, model["controller.period"]
+    margins = {s: NEAR_A_STOP * model.values.get(s.noise, 0.0) for s in signals.outputs
+               if s.unit == signals.controlled.unit}
+    margins[signals.drive] = 2.5e-6 * model.values.get(signals.drive.limit, 0.0)  # two counts of the drive frame
+    # parameter, signal, limit, frame, values at and below which and at and above which it is reached
+    bounds = [(s.limit, s.name, limit, "", margin - limit, limit - margin) for s, margin in margins.items()
+              if (limit := model.values.get(s.limit)) is not None]  # the plant declares one
+    bounds += [bound for frame, name, low, high in bench.list_ranges("output", "load")
+               for bound in (("", name, low, frame, low, np.inf), ("", name, high, frame, -np.inf, high))]
+    return tuple(LimitReached(parameter, name, limit, (int(rows[0]) - zero) * period, len(rows) * period, frame)
+                 for parameter, name, limit, frame, low, high in bounds
+                 if len(rows := np.flatnonzero((column(name) <= low) | (column(name) >= high)))
+                 and limit)  # an unsigned number is also 0 at rest
 
 
 FDI_FAILS = ("MAINTENANCE", "NON_NOMINAL", "SOMETHING_ELSE")  # verdicts of rig fdi that fail a run

@@ -8,7 +8,7 @@ test of a plant is the profile that it declares, or the main phase of preflight.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
@@ -166,14 +166,14 @@ class Sequence:
         """The command after main, or after it was broken off at the demand `start`, SI."""
         return build_profile(self.cleanup, start, self.rate)
 
-    def list_demands(self) -> Iterator[tuple[str, Array]]:
-        """Key of each segment of the command, such as "main[1]", and its demands, SI; the last of a phase with its end.
-        """
-        end = 0.0
-        for phase in PHASES[:-1]:
-            values, sections, end = build_profile(getattr(self, phase), end, self.rate)
-            for i, section in enumerate(sections):
-                yield f"{phase}[{i}]", np.append(values, end)[section.start:section.stop + (i == len(sections) - 1)]
+    def split_phase(self, phase: str) -> list[Array]:
+        """The values of each segment of a phase, SI; of the last one also the value that it ends at."""
+        profiles: dict[str, Callable[[], Profile]] = {
+            "setup": self.setup_profile, "main": self.main_profile,
+            "cleanup": lambda: self.cleanup_profile(self.main_profile().end),
+            "load": lambda: build_profile(self.load, rate=self.rate)}
+        values, sections, end = profiles[phase]()
+        return [np.append(values, end)[each.start:each.stop + (each is sections[-1])] for each in sections]
 
     def sections(self) -> dict[str, slice]:
         """Rows of main by section name, as checks see them."""
@@ -386,21 +386,19 @@ def _check_phases(sequence: Sequence, place: Place) -> None:
 
 def _check_sizes(sequence: Sequence, place: Place) -> None:
     """No demand and no load of a size that can only be a slip of units."""
-    start, signals = 0.0, find_plant(sequence.plant).signals
+    signals = find_plant(sequence.plant).signals
     place.at("load").require(not sequence.load or signals.load, "no load: the plant has none")
     for phase in PHASES:
-        signal, begin = (signals.load or signals.command, 0.0) if phase == "load" else (signals.command, start)
-        most, unit = signal.largest, signal.unit
+        signal = signals.load or signals.command if phase == "load" else signals.command
         with np.errstate(all="ignore"):  # what overflows is refused below
             try:
-                values, sections, start = build_profile(getattr(sequence, phase), begin, sequence.rate)
+                parts = sequence.split_phase(phase)
             except InputError as error:  # a function that computes a segment
                 raise (place.at(phase).refuse(error.expected) if error.where == "segment" else error) from error
-        for i, section in enumerate(sections):
-            last = start if i == len(sections) - 1 else 0.0
-            largest = np.abs((*values[section.start:section.stop], last)).max()
-            place.at(phase, i).require(largest <= most,  # nor NaN
-                                       f"at most {most:g} {unit} either way, not {largest:g}")
+        for i, values in enumerate(parts):
+            largest = np.abs(values).max()
+            place.at(phase, i).require(largest <= signal.largest,  # nor NaN
+                                       f"at most {signal.largest:g} {signal.unit} either way, not {largest:g}")
 
 
 def _check_faults(sequence: Sequence, place: Place) -> None:
