@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from canopen.objectdictionary.datatypes import DOMAIN
 
+from rig.benches import PARAMETERS
 from rig.conformance.target import (
     HISTORY,
     NO_DATA,
@@ -96,7 +97,8 @@ def check_default(t: Target, variable: Variable) -> None:
 def list_constants(t: Target) -> list[Variable]:
     """What cannot change. The serial number is the device's own."""
     return [variable for variable in list_readable(t)
-            if (variable.access == "const" or variable.index in (0x1000, 0x1018))
+            if (variable.access == "const" or variable.index in (0x1000, 0x1018)
+                or (variable.access == "ro" and (variable.index in PARAMETERS or variable.is_mapping)))
             and variable.default_bytes is not None and variable.key != (0x1018, 4)]
 
 
@@ -192,7 +194,8 @@ CASES = (
          for_each(list_readable, check_readable, "object", "{} read")),
     Case("2.2", "lengths", "7.1.4", "each value has as many bytes as its data type",
          for_each(lambda t: read_values(t, lambda each: each.size), check_length, "value")),
-    Case("2.3", "constants", "7.4, 7.5.2.21", "const objects, device type and identity hold the values of the EDS",
+    Case("2.3", "constants", "7.4, 7.5.2.21",
+         "const objects, device type, identity and PDO parameters that are ro hold the values of the EDS",
          for_each(list_constants, check_default, "constant")),
     Case("2.4", "defaults after a reset", "7.3.2.2.1",
          "communication objects hold the defaults of the EDS after a reset of the communication",

@@ -162,8 +162,9 @@ def test_missing_mandatory_object(tmp_path: Path) -> None:
 def test_data_sheet_that_promises_more_than_the_node_has(tmp_path: Path) -> None:
     """The tester reads another type, another default and another object than the node has."""
     path = change_sheet(tmp_path, ("2200", "DataType=0x0004", "DataType=0x0003"), ("1017", "DefaultValue=100",
-                                                                               "DefaultValue=200"))
-    assert {"2.2", "2.4"} <= set(list_cases(examine(nothing, chapters=("2",), sheet=path)))
+                                                                               "DefaultValue=200"),
+                        ("1800sub2", "AccessType=rw\nDefaultValue=0x1", "AccessType=ro\nDefaultValue=0x2"))
+    assert {"2.2", "2.3", "2.4"} <= set(list_cases(examine(nothing, chapters=("2",), sheet=path)))
 
 
 @pytest.mark.parametrize("text", ["", "not an EDS", "[1000]\n", "[DeviceInfo]\n[1000]\nParameterName=x\nDataType=zz\n"])
