@@ -7,6 +7,7 @@ from statistics import fmean
 from rig.benches import Pdo
 from rig.conformance.pdo_cases import (
     EXTENDED,
+    TOO_SHORT,
     list_received,
     operational,
     read_mapped,
@@ -75,10 +76,13 @@ def check_reported_once(t: Target) -> str:
     pdo = find_rpdo(t)
     values = read_mapped(t, pdo)
     with operational(t):
+        mark = len(t.frames)
         require(send_short(t, pdo, values), "no EMCY at the first")
-        require(not send_short(t, pdo, values, is_expected=False), "a second EMCY for the same error")
+        send_short(t, pdo, values, is_expected=False)
+        codes = [code for code in list_codes(t, mark) if code in (0, TOO_SHORT)]
+        require((TOO_SHORT, TOO_SHORT) not in pairwise(codes), "a second EMCY for the same error")
         send_values(t, pdo, values)
-    return f"one EMCY for two short frames of {pdo.name}"
+    return f"EMCY 0x8210 for two short frames of {pdo.name}: {codes.count(TOO_SHORT)}"
 
 
 def check_error_reset(t: Target) -> str:
@@ -88,8 +92,8 @@ def check_error_reset(t: Target) -> str:
     if t.sheet.is_writable(*CYCLE):
         t.try_download(*CYCLE, 0)  # or else the pause of SYNC before the register is read is an error, too
     with operational(t):
+        mark = len(t.frames)  # some nodes say at once that the error is over
         require(send_short(t, pdo, values), "no EMCY for a PDO that is too short")
-        mark = len(t.frames)
         send_values(t, pdo, values)
         t.wait(t.options.timeout, lambda: 0 in list_codes(t, mark))
         require(0 in list_codes(t, mark), "no EMCY 0x0000")
@@ -312,7 +316,7 @@ CASES = (
          partial(check_identifier, index=0x1014)),
     Case("5.3", "emergency", "7.2.7",
          "8 bytes: error code, error register as in 0x1001 with bit 0 set", check_emergency),
-    Case("5.4", "an error is reported once", "7.2.7.1", "no second EMCY while the same error stands",
+    Case("5.4", "an error is reported once", "7.2.7.1", "no second EMCY while the same error stands; 0x0000 ends it",
          check_reported_once),
     Case("5.5", "the error is gone", "7.2.7.1",
          "EMCY 0x0000 with the remaining error register, which is that of 0x1001",
