@@ -378,11 +378,12 @@ class Session:
             return rows
 
         history, after = self.log.history, self.log.after
+        run = read_rows(history, is_judged & starter.find_on_time_of(history, self.faults))
         return ProtocolRecord(
             enabling=[(cycle, each.rows) for cycle, each in self._enablings],
-            run=read_rows(history, is_judged & starter.find_on_time_of(history, self.faults)),
+            run=Rows._make(map(np.concatenate, zip(run, read(after), strict=True))),
             probes=[Rows._make(column[-cycles:] for column in read(probe)) for probe in starter.probes if len(probe)],
-            after=read(after) if len(after) else None, emergencies=self.nodes.emergencies,
+            emergencies=self.nodes.emergencies,
             heartbeats={NAMES[node]: times for node, times in self.nodes.heartbeats.items()},
             heard=(self.stage.begun_ns * 1e-9, self.stage.clock.now() * 1e-9),
             deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,

@@ -119,18 +119,18 @@ class Emergency(NamedTuple):
 class ProtocolRecord:
     """All that the protocol checks are judged by.
 
-    `enabling`: cycles beside the run in which the controller was enabled, and the cycle before which that was. `gains`:
-    those that objects of the controller hold, if it has them and follows them. `is_response_judged`: real time, and the
-    controller is not in the rig's own process. `heartbeats`: of the nodes that send one, by name; `heard`: first and
-    last time at which heartbeats could have been received, s; `deaf`: how long of it the rig received nothing, s;
-    `deaf_cycles`: in which, so that an EMCY of the controller may be missing here. `unsound`: frames of
-    the controller with a wrong checksum or alive counter, as far as no fault of the sequence acts on frames.
+    `run`: its rows, then those of the probe after clean-up. `enabling`: cycles beside the run in which the
+    controller was enabled, and the cycle before which that was. `gains`: those that objects of the controller hold,
+    if it has them and follows them. `is_response_judged`: real time, and the controller is not in the rig's own
+    process. `heartbeats`: of the nodes that send one, by name; `heard`: first and last time at which heartbeats
+    could have been received, s; `deaf`: how long of it the rig received nothing, s; `deaf_cycles`: in which, so
+    that an EMCY of the controller may be missing here. `unsound`: frames of the controller with a wrong checksum or
+    alive counter, as far as no fault of the sequence acts on frames.
     """
 
     run: Rows
     enabling: Sequence[tuple[int, Rows]] = ()
     probes: Sequence[Rows] = ()
-    after: Rows | None = None
     emergencies: Sequence[Emergency] = ()
     heartbeats: Mapping[str, Sequence[Heartbeat]] = field(default_factory=dict)
     heard: tuple[float, float] = (0.0, 0.0)
@@ -148,16 +148,14 @@ class ProtocolRecord:
     @property
     def stretches(self) -> list[Rows]:
         """All rows, in stretches of consecutive cycles."""
-        after = [self.after] if self.after is not None else []
-        return [*self.probes, *(rows for _, rows in self.enabling), self.run, *after]
+        return [*self.probes, *(rows for _, rows in self.enabling), self.run]
 
     def join_rows(self) -> Rows:
-        """The rows of the run with those in which the controller was enabled, and those after it, in order."""
-        pieces = (self.run,) if self.after is None else (self.run, self.after)
-        parts = [np.concatenate(columns) for columns in zip(*pieces, strict=True)]
+        """The rows of the run with those in which the controller was enabled, in order."""
+        whole = self.run
         for cycle, rows in reversed(self.enabling):
-            parts = [np.insert(whole, cycle, part) for whole, part in zip(parts, rows, strict=True)]
-        return Rows(*parts)
+            whole = Rows._make(np.insert(column, cycle, part) for column, part in zip(whole, rows, strict=True))
+        return whole
 
     @property
     def words(self) -> ProfileWords:
@@ -346,6 +344,8 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
     wrong = missing = cycles = 0
     for rows in record.stretches:
         is_judged = rows.on_time & ~_find_faulty(record) if rows is record.run else rows.on_time
+        # the first of the frames that come in every n-th cycle may come as late as in the n-th
+        is_judged = is_judged & (np.arange(len(is_judged)) >= record.bench.frames.drive.every - 1)
         flags = np.append(rows.flags[1:], 0).astype(int)  # what the plant found at the next SYNC
         is_wrong = is_judged & (flags & int(Flags.DRIVE_LATE) != 0)
         is_missing = is_judged & ~is_wrong & (np.isnan(rows.drive) | (flags & int(Flags.DRIVE_MISSING) != 0))
