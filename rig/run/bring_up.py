@@ -9,7 +9,8 @@ controller back to the same state, so the rows of the sequence are those of a ru
 reset: there it is played once, and the ram goes back to where it began. After clean-up the controller is disabled once
 more. A controller that nothing disables is asked for nothing in these steps: it would obey, and its integral remember.
 
-The controller is made ready in cycles that do not count: CiA 402 is enabled step by step, then its own words say so.
+The controller is made ready in cycles that do not count: CiA 402 is enabled step by step, or gets the values of set-up,
+until its own words say so.
 The run stands still meanwhile: neither its profiles nor its faults go on. In real time the last input is repeated until
 the next one, which waits for the answer to it.
 """
@@ -107,8 +108,13 @@ def find_distance(bench: Bench) -> float:
 
 def find_disabled(bench: Bench) -> int:
     """The control word of a probe with which the controller is disabled."""
-    words = PROFILES[bench.profile]
-    return words.ladder[State.READY] if bench.profile == "none" and not bench.is_enabled("setup") else words.ladder[0]
+    goal = find_goal(bench, "setup")
+    return PROFILES[bench.profile].ladder[goal if goal is State.READY else State.OFF]
+
+
+def find_goal(bench: Bench, phase: str) -> State:
+    """What a phase asks for: ACTIVE, or READY where its values take the place of a control word and do not enable."""
+    return State.READY if bench.profile == "none" and not bench.is_enabled(phase) else State.ACTIVE
 
 
 def list_last_steps(bench: Bench) -> tuple[Step, ...]:
@@ -171,7 +177,6 @@ def read_rows(history: History, on_time: Mask) -> Rows:
 
 
 LIMIT = 5.0  # s: a controller that is not ready by then ends the run
-TIME_TO_SAY = 20  # cycles, beside two of the slowest frame, until a controller has said whether it is ready
 
 
 class Enabling:
@@ -191,14 +196,14 @@ class Enabling:
         return Rows(zero, zero, current, control, status, zero, zero, on_time=zero > 0)
 
     def enable(self, demand: float) -> str:
-        """Climb to ACTIVE, with fault reset, holding `demand`, m; why that failed, or ""."""
+        """Climb as far as set-up asks, with fault reset, holding `demand`, m; why that failed, or ""."""
         if not self._words.is_confirmed:
             return ""
-        control = 0
+        control, goal = 0, find_goal(self._bench, "setup")
 
         def step() -> CycleInput:
             nonlocal control
-            control = choose_control(self._words, State.ACTIVE, self._find_state(), control, resets=True)
+            control = choose_control(self._words, goal, self._find_state(), control, resets=True)
             return CycleInput(0, demand, 0.0, control, is_counted=False)
 
         for _ in range(2):  # the second shows whether the first was answered: a status word from before says nothing
@@ -210,35 +215,27 @@ class Enabling:
             f"the controller is not enabled after {LIMIT:g} s: status word 0x{status:04X}, "
             f"{State(self._find_state()).name.lower().replace('_', ' ')}")
 
-    def await_ready(self, demand: float, control: int, main_control: int) -> str:
-        """Wait, at a `demand` in m, until the controller is ready; why it is not, or "".
-
-        A controller that is not ready with the values of set-up and `control`, although it had the time to say so, gets
-        the values of main and `main_control`: it may say that it is ready as soon as it is enabled.
-        """
+    def await_ready(self, demand: float, control: int) -> str:
+        """Wait with the values of set-up, at a `demand` in m, until the controller is ready; why it is not, or ""."""
         def is_ready() -> bool:
             return all(self._has(name, value) for name, value in self._bench.ready.items())
 
         at_rest = CycleInput(0, demand, 0.0, control, is_counted=False)
         self._play(at_rest)
-        slowest = max(frame.every for frame in self._bench.frames.frames)
-        self._play_until(is_ready, lambda: at_rest, 2 * slowest + TIME_TO_SAY)
-        if self._play_until(is_ready, lambda: CycleInput(1, demand, 0.0, main_control, is_counted=False)):
+        if self._play_until(is_ready, lambda: at_rest):
             return ""
         details = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
                             for name, value in self._bench.ready.items() if not self._has(name, value))
-        return self._describe_silence() or f"the controller is not ready after {LIMIT:g} s: {details}"
+        return self._describe_silence() or (
+            f"the controller is not ready after {LIMIT:g} s with the values of setup: {details}")
 
     def _describe_silence(self) -> str:
         missing = describe_missing(self._bench, self._silent, self._loop.describe_refusal())
         return f"{self._bench.describe_node(CONTROLLER)}: {missing}" if self._silent else ""
 
-    def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput], most: int = 0) -> bool:
-        """Play cycles until `is_done()`; False if that takes too long, True also when the run is to end.
-
-        `most`: cycles; default what `LIMIT` allows.
-        """
-        clock, remaining_cycles = WallClock(), most or round(LIMIT * 1e9 / self._bench.cycle_ns)
+    def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput]) -> bool:
+        """Play cycles until `is_done()`; False if that takes longer than `LIMIT`, True also when the run is to end."""
+        clock, remaining_cycles = WallClock(), round(LIMIT * 1e9 / self._bench.cycle_ns)
         while not is_done():
             remaining_cycles -= 1
             is_over = clock.now() > LIMIT * 1e9 if self._realtime else self._silent >= PATIENCE
@@ -373,11 +370,10 @@ class BringUp:
         """Enable the controller for a probe; why that failed, or ""."""
         bench = self._job.bench
         enabling = Enabling(bench, loop, self._job.realtime, lambda: bool(self._safety.aborted) or self._stop())
-        has_word, active = bench.profile != "none", PROFILES[bench.profile].ladder[State.ACTIVE]
-        problem = enabling.enable(0.0) if has_word else ""
+        problem = enabling.enable(0.0)
         if problem or not bench.ready:
             return problem
-        return enabling.await_ready(0.0, active if has_word else find_disabled(bench), active)
+        return enabling.await_ready(0.0, PROFILES[bench.profile].ladder[find_goal(bench, "setup")])
 
     def _identify_nodes(self) -> None:
         """Read and log what the nodes say about themselves; refuse another device, and a firmware that the sequence is

@@ -23,6 +23,7 @@ from rig.run.attribution import find_injected
 from rig.run.bring_up import (
     BringUp,
     Enabling,
+    find_goal,
     list_first_steps,
     list_inputs,
     list_last_steps,
@@ -231,8 +232,8 @@ class Session:
         """Between set-up and main: wait until the controller says that it is ready; False when the run is to end."""
         if not self.job.bench.ready:
             return True
-        words = [self._choose_control_word(phase, 0) for phase in (SETUP, MAIN)]
-        return self._go_on("ready", self._enablings[0][1].await_ready(self._demand, *words), CONTROLLER)
+        control = self._choose_control_word(SETUP, 0)
+        return self._go_on("ready", self._enablings[0][1].await_ready(self._demand, control), CONTROLLER)
 
     def _go_on(self, kind: str, problem: str, node: Role) -> bool:
         """End the run because of a problem of a node; whether it goes on."""
@@ -319,10 +320,8 @@ class Session:
         words = self._words
         if phase == CLEANUP and self.safety.is_safe and i == self._reset_at and not words.is_confirmed:
             return words.reset
-        if self.job.bench.profile == "none" and not self.job.bench.is_enabled(PHASES[phase]):
-            return words.ladder[State.READY]
         # without set-up main is where it is enabled; one cycle each on the way to ACTIVE where nothing is confirmed
-        state = State.ACTIVE if words.is_confirmed else self.stage.playing.queued + 1
+        state = find_goal(self.job.bench, PHASES[phase]) if words.is_confirmed else self.stage.playing.queued + 1
         return words.ladder[min(state, State.ACTIVE)]
 
     def _discard_queue(self) -> None:

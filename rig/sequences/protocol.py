@@ -187,9 +187,10 @@ def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[C
     idle = _drop_missing([rows.drive[find_idle(rows, record.words, limits, rate)] for rows in record.stretches])
     drive = record.bench.signals.drive
     idle_name, limit_name = f"no {drive.phrase} unless {record.words.active}", f"{drive.phrase} within its limit"
-    if record.bench.profile == "none" and not record.bench.enables:
-        yield SkippedCheck(idle_name,
-                           "the bench has no control word, and no value of its phases enables the controller")
+    is_always_active = all(_find_active(rows, record.words).all() for rows in record.stretches)
+    if record.bench.profile == "none" and (is_always_active or not record.bench.enables):
+        yield SkippedCheck(idle_name, "the bench has no control word, and no value of its phases in this run disables "
+                                      "the controller")
     else:
         largest = limits.idle_current + record.bench.find_least(drive.word)
         yield _judge_largest(idle_name, drive, idle, largest, f"{len(idle)} cycles")

@@ -98,14 +98,16 @@ class CanDevice(PythonDevice):
     """A controller whose frames a DBC describes, encoded and decoded by cantools; it answers the message `on`.
 
     `scale`: m a unit of the positions, A a unit of the current. The signals are named Position (in Demand or on its
-    page), Measured and Current.
+    page), Measured and Current. With Start it is ready, State 5, once that has been 1, and sends a current while it is
+    2; 0 ends both.
     """
 
     def __init__(self, where: str, dbc: str, on: str, position: float, current: float, fd: bool = False) -> None:
         super().__init__(where, fd)
         self._database = cantools.database.load_string(dbc, "dbc")
         self._on, self._position, self._current = on, position, current
-        self._values = {"Position": 0.0, "Measured": 0.0}
+        self._values = {"Position": 0.0, "Measured": 0.0, "Start": 2}
+        self._state = 5
 
     def take(self, message: can.Message) -> list[can.Message]:
         try:
@@ -116,8 +118,12 @@ class CanDevice(PythonDevice):
         self._values |= values
         if definition.name != self._on or "Measured" not in values:  # once a cycle, not for each page
             return []
-        amperes = compute_current(*(self._values[name] * self._position for name in ("Position", "Measured")))
+        start = self._values["Start"]
+        self._state = {0: 0, 1: 5}.get(start, self._state)
+        amperes = (self._state and start == 2) * compute_current(
+            *(self._values[name] * self._position for name in ("Position", "Measured")))
         answer = self._database.get_message_by_name("Drive")
-        signals = {each.name: 0 for each in answer.signals} | {"Current": amperes / self._current}
+        signals = {each.name: 0 for each in answer.signals} | {
+            "State": self._state, "Current": amperes / self._current}
         return [can.Message(arbitration_id=answer.frame_id, data=answer.encode(signals, strict=False),
                             is_extended_id=answer.is_extended_frame, is_fd=answer.length > 8)]

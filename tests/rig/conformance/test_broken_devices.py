@@ -446,9 +446,8 @@ DEFECTS: list[tuple[str, Break, str]] = [
     ("mapped objects swapped", send_instead(0x283, lambda data: data[:4] + data[6:8] + data[4:6]), "4.16"),
     ("no EMCY", send_instead(EMCY, lambda data: None), "4.12 4.14 5.3 5.4 5.5 5.6 5.10 5.17"),
     ("EMCY repeated", wrap("emcy.raise_error", repeat_emcy), "5.4"),
-    ("no defect: a short PDO is over at once", wrap(
-        "emcy.raise_error", lambda device, old, code, *more: (old(code, *more), device.emcy.clear(code * (code == 0x8210)))),
-     ""),
+    ("no defect: a short PDO is over at once", wrap("emcy.raise_error", lambda device, old, code, *more: (
+        old(code, *more), device.emcy.clear(code * (code == 0x8210)))), ""),
     ("EMCY 0x0000 missing", send_instead(EMCY, lambda data: data if data[:2] != b"\0\0" else None), "5.5"),
     ("error register without bit 0", send_instead(EMCY, lambda data: data[:2] + bytes((data[2] & ~1,)) + data[3:]),
      "5.3"),
