@@ -46,7 +46,8 @@ HEARTBEAT, HEARTBEAT_LIMIT = 100, 300  # ms
 PATIENT = 10_000  # ms: the limit where the wall clock says nothing about the run, in lockstep between processes
 BOOT_TIMEOUT = 2.0  # s
 NMT, SDO_ANSWER, HEARTBEAT_ID = 0x000, 0x580, 0x700  # predefined connection set (CiA 301, 7.3.5)
-DEVICE_TYPE, MODE, MODE_DISPLAY = 0x1000, 0x6060, 0x6061  # objects; the modes are those of CiA 402
+# objects; the modes are those of CiA 402
+DEVICE_TYPE, MODE, MODE_DISPLAY, SUPPORTED_MODES = 0x1000, 0x6060, 0x6061, 0x6502
 
 
 class BusError(RigError):
@@ -353,7 +354,7 @@ class Master:
 
         Raises:
             BusError: the drive refuses it.
-            InputError: it shows another one after a second.
+            InputError: it shows another one after a second, and does not say in 0x6502 that it has this one.
         """
         node = self._bench.nodes.get(Role.CONTROLLER)
         if node is None or node.mode is None or any(spec.has("mode") for spec in self._bench.frames.frames):
@@ -366,6 +367,9 @@ class Master:
             if mode == node.mode:
                 return
             self.wire.wait(lambda: False, 0.05)
+        supported_modes = int.from_bytes(self._upload(Role.CONTROLLER, SUPPORTED_MODES, 0) or b"", "little")
+        if node.mode > 0 and supported_modes >> (node.mode - 1) & 1:  # what is shown may follow in OPERATIONAL, at SYNC
+            return
         raise InputError(next(iter(self._bench.files), self._bench.name), "controller.mode",
                          f"a mode of {self._bench.describe_node(Role.CONTROLLER)}, not {node.mode}: "
                          f"{name_object(MODE_DISPLAY, 0)} shows {mode}")

@@ -149,6 +149,8 @@ def test_the_mode_of_a_drive_is_set_and_read_back(tmp_path: Path) -> None:
     other = Place(tmp_path, text=BENCH.replace('profile = "cia402"', 'profile = "cia402"\nmode = 7'))
     assert catch_refusal(other.master.configure, b"", None, 0) == (
         "bench.toml: controller.mode: expected a mode of node 5 controller, not 7: 0x6061 shows 0")
+    Place(tmp_path, {**ALL, "6502": Entry(7, "ro", "0x40")},  # it has the mode, and shows it later
+          BENCH.replace('"cia402"', '"cia402"\nmode = 7')).master.configure(b"", None, 0)
     with pytest.raises(BusError, match="node 5 controller, object 0x6060: Code 0x06090030"):
         Place(tmp_path, refused=0x6060).master.configure(b"", None, 0)
     sheet = format_eds(ALL, (Mapped((0x2000_0020, 0x6040_0010, 0x6060_0008), "$NODEID+0x200"), RPDOS[1]), TPDOS)
