@@ -139,7 +139,7 @@ class Master:
     @property
     def watched(self) -> list[Role]:
         """The nodes that send a heartbeat, or can be told to."""
-        return [role for role in sorted(self._nodes) if self._find_heartbeat(role)]
+        return [role for role in sorted(self._nodes) if self.find_heartbeat(role)]
 
     def _join(self, role: Role) -> Any:  # the library's node; its types are too loose to help
         name, text = self._bench.read_data_sheet(role)
@@ -325,7 +325,7 @@ class Master:
                     if role is not Role.CONTROLLER or parameters is not None:
                         raise
         self._set_mode()
-        self._watch.configure([self._bench.nodes[role].node << 16 | max(limit_ms, 3 * self._find_heartbeat(role))
+        self._watch.configure([self._bench.nodes[role].node << 16 | max(limit_ms, 3 * self.find_heartbeat(role))
                                for role in self.watched])
         self._beat.configure(HEARTBEAT if self._nodes else 0, self.wire.clock.now())
         self._beat_ns, self._last_pause_ns, self._limit_ns = 0, 0, limit_ms * 1_000_000
@@ -334,7 +334,7 @@ class Master:
         variable = find_variable(self._nodes[role].object_dictionary, index, sub)
         return variable is not None and variable.writable
 
-    def _find_heartbeat(self, role: Role) -> int:
+    def find_heartbeat(self, role: Role) -> int:
         """Period of a node's heartbeat, ms: ours if it can be set, else that of the data sheet; 0: it has none."""
         period = read_number(self._nodes[role].object_dictionary, 0x1017, 0) or 0
         return HEARTBEAT if self._is_writable(role, 0x1017, 0) else period
@@ -457,7 +457,7 @@ class Master:
         for role in self._nodes:
             self._command_node(role, command)
             self._started_ns[role] = self.wire.clock.now()
-            if not self._find_heartbeat(role):  # it will not say so
+            if not self.find_heartbeat(role):  # it will not say so
                 self._note_state(role, state)
 
     def _command_node(self, role: Role, command: NmtCommand) -> None:

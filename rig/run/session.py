@@ -17,7 +17,7 @@ import numpy as np
 from fdi.progress import Progress
 from plant import Array, Hold, Profile, build_profile, control_by_pid
 from rig.benches import PROFILES, Role, State, unpack
-from rig.network import CONTROLLER, HEARTBEAT, NAMES, PLANT, CycleRecord, EmbeddedWire, Frame, Master, NmtState, Wire
+from rig.network import CONTROLLER, NAMES, PLANT, CycleRecord, EmbeddedWire, Frame, Master, NmtState, Wire
 from rig.recorder import CycleBlock, Recorder, Signals, Timing
 from rig.run.attribution import find_injected
 from rig.run.bring_up import (
@@ -387,7 +387,8 @@ class Session:
             heard=(self.stage.begun_ns * 1e-9, self.stage.clock.now() * 1e-9),
             deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,
             unsound=self.stage.playing.unsound if not job.sequence.disturbs_bus else 0,
-            deaf_cycles=self.faults.list_frame_hits("rig")[:, 0].tolist(), heartbeat_period=HEARTBEAT * 1e-3,
+            deaf_cycles=self.faults.list_frame_hits("rig")[:, 0].tolist(), heartbeat_periods={
+                NAMES[node]: self._master.find_heartbeat(node) * 1e-3 for node in self.nodes.heartbeats},
             bench=job.bench,
             drive_limit=model.values.get(model.kind.signals.drive.limit, np.nan) if starter.gains is None
             else starter.gains.current_limit,

@@ -137,7 +137,7 @@ class ProtocolRecord:
     deaf: float = 0.0
     deaf_cycles: Sequence[int] = ()
     unsound: int = 0
-    heartbeat_period: Second = 0.1
+    heartbeat_periods: Mapping[str, Second] = field(default_factory=dict)  # of the nodes; 0.1 s unless it says another
     bench: Bench = field(default_factory=load_bench)
     drive_limit: float = nan  # NaN: the plant declares none
     still_limit: float = 1e-4  # SI: how far the error may move while the drive stands still; NaN: not to be judged
@@ -492,11 +492,12 @@ def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterato
     if Role.CONTROLLER.name.lower() not in record.heartbeats:
         yield SkippedCheck("heartbeat period, controller", "the controller sends no heartbeat")
     begin, end = record.heard
-    period, tolerance = record.heartbeat_period, limits.heartbeat
-    longest_pause = 3.0 * period  # s: then a node counts as silent
-    if end - begin - record.deaf < longest_pause:
-        return
+    tolerance = limits.heartbeat
     for node, beats in record.heartbeats.items():
+        period = record.heartbeat_periods.get(node, 0.1)
+        longest_pause = 3.0 * period  # s: then a node counts as silent
+        if end - begin - record.deaf < longest_pause:
+            continue
         t, waited = np.array(beats, float).reshape(-1, 2).T
         gaps = np.diff(t)[np.maximum(waited[1:], waited[:-1]) <= tolerance]
         if len(gaps) == 0 and len(beats) > 1:

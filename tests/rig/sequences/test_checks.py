@@ -247,9 +247,10 @@ LATE = [Heartbeat(0.15 * k, 0.06) for k in range(6)]  # the rig stood still befo
 def test_heartbeats_that_waited_for_the_rig_are_not_judged(beats: list[Heartbeat], deaf: float, passes: list[bool]
                                                            ) -> None:
     rows = Rows(*[np.zeros(5)] * 7, on_time=np.ones(5, bool))
-    record = ProtocolRecord(run=rows, heartbeats={"controller": beats}, heard=(0.0, 1.0), deaf=deaf, drive_limit=8e-3)
+    record = ProtocolRecord(run=rows, heartbeats={"controller": beats, "plant": SLOW}, heartbeat_periods={"plant": 0.2},
+                            heard=(0.0, 1.0), deaf=deaf, drive_limit=8e-3)
     checks = judge_protocol(record, ProtocolLimits())[0]
-    assert [check.passed for check in checks if check.signal == "heartbeat"] == passes
+    assert [check.passed for check in checks if check.signal == "heartbeat"] == [*passes, *([] if deaf else [True])]
 
 
 @pytest.mark.parametrize(("frozen", "limit", "is_found"), [
