@@ -22,7 +22,6 @@ from .frame import (
 )
 from .heartbeat import HeartbeatConsumer as HeartbeatConsumer, HeartbeatProducer as HeartbeatProducer
 from .master import (
-    HEARTBEAT as HEARTBEAT,
     HEARTBEAT_LIMIT as HEARTBEAT_LIMIT,
     PATIENT as PATIENT,
     BusError as BusError,
