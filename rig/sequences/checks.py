@@ -588,8 +588,8 @@ KINDS: dict[str, Kind] = {
         np.abs(run.read_signal(check.signal, span)).max()), OfSignal),
     "amplitude_ratio": Kind("Amplitude of the position over that of the demand at one frequency.", "1",
                             lambda *given: abs(_read_response(*given)), AtFrequency),
-    "phase_lag": Kind("By how much the position is behind the demand at one frequency, deg.", "deg",
-                      lambda *given: -degrees(phase(_read_response(*given))), AtFrequency),
+    "phase_lag": Kind("By how much the position is behind the demand at one frequency, deg from -90 up to 270.", "deg",
+                      lambda *given: (90.0 - degrees(phase(_read_response(*given)))) % 360.0 - 90.0, AtFrequency),
     "response_within": Kind("Time from `after` (a fault's name or s of main) to an event, or to a signal passing a "
                             "level for 3 samples, s.", "s", _measure_response, Response, is_rounded=True),
     "shut_off": Kind("Time from `after` to the drive frame from which on the controller says zero current and no "
