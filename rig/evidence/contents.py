@@ -1,5 +1,6 @@
 """What goes into a package: runs as they were written, inputs from their logs, a bill of materials, coverage."""
 
+import hashlib
 import json
 import platform
 import re
@@ -137,10 +138,10 @@ def _read_suite(file: Path, base: str, package: Package) -> dict[str, JudgedRun]
 
 
 def _read_run(file: Path, name: str, requirement: tuple[str, ...]) -> PackedRun:
-    """A run, whose verdict.json and log must say the same."""
+    """A run, whose verdict.json must be what its log says: by its SHA-256, which logs of earlier versions lack."""
     trace = Trace.read(file.parent / "trace.mcap", all=True)
     try:
-        answer = _read_json(file)
+        answer, digest = _read_json(file), hashlib.sha256(read_file(file)).hexdigest()
         answer_rows = [(each["name"], each["value"], each["verdict"], ", ".join(each["requirement"]))
                        for each in answer["checks"]]
         checks = [JudgedCheck(each["name"], tuple(each["requirement"]), each["verdict"]) for each in answer["checks"]
@@ -150,8 +151,9 @@ def _read_run(file: Path, name: str, requirement: tuple[str, ...]) -> PackedRun:
         raise InputError(file, "", f"the verdict of a run by this version ({error})") from error
     log_verdict = trace.provenance.get("verdict.verdict", "")
     log_rows = [(check.name, to_plain(check.value), check.verdict, check.requirement) for check in trace.checks]
-    require(run.verdict == log_verdict and answer_rows == log_rows, file, "verdict",
-            f"what its log says, {log_verdict or 'no verdict'}, check by check")
+    is_same = trace.provenance.get("verdict.sha256", digest) == digest
+    require(is_same and run.verdict == log_verdict and answer_rows == log_rows, file, "verdict",
+            f"what its log says, {log_verdict or 'no verdict'}, check by check and byte by byte")
     return PackedRun(answer, trace, run)
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import hashlib
 import json
 import os
 from collections import Counter
@@ -285,9 +286,9 @@ class Outcome:
         return {"t": f"{cause['t']:.3f}", "source": cause["source"], "text": cause["text"],
                 "evidence": json.dumps(cause["evidence"]), "consequences": json.dumps(attribution["consequences"])}
 
-    def save(self) -> None:
-        """Write verdict.json."""
-        write_text(self.folder / "verdict.json", json.dumps(self.to_json(), indent=1) + "\n")
+    def format_json(self) -> str:
+        """The text of verdict.json, whose SHA-256 stands in the log."""
+        return json.dumps(self.to_json(), indent=1) + "\n"
 
 
 def select_events(events: Sequence[Event], most: int = 200) -> tuple[list[Event], dict[str, int]]:
@@ -417,7 +418,7 @@ def run_job(job: Job, folder: Path, progress: Progress, stop: Callable[[], bool]
                 with (open_recorder(job, folder, epoch_ns, observer) as recorder,
                       contextlib.closing(Session(job, wire, processes, recorder, progress, stop)) as session):
                     outcome = play_job(job, folder, session, recorder, progress, diagnose)
-                outcome.save()
+                write_text(folder / "verdict.json", outcome.format_json())
         except BaseException:
             with contextlib.suppress(InputError):  # the exception of the run comes first
                 _play_steps(job, folder, "after", "")
@@ -463,7 +464,7 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
     diagnosis = diagnose(make_main_trace(job, folder, history)) if diagnose and not session.safety.interrupted else {}
     safety, starter = session.safety, session.starter
     outcome = Outcome(
-        job=job, folder=folder, checks=checks, skipped=skipped_checks, events=session.journal.events,
+        job=job, folder=folder, checks=checks, skipped=skipped_checks, events=tuple(session.journal.events),
         aborted=safety.aborted, safe=safety.is_safe, interrupted=safety.interrupted, fdi=diagnosis,
         attribution=attribution, timing=summarise_timing(history, loop, scheduler, kind, reason),
         counters=_count_lost_frames(history), speed=len(history) * job.period_ns * 1e-9 / seconds,
@@ -481,7 +482,8 @@ def play_job(job: Job, folder: Path, session: Session, recorder: Recorder, progr
                 "faults": describe_faults(fdi)} if fdi else {},
         "cause": outcome.describe_attribution() if cause is not None else {},
         "verdict": {"verdict": outcome.verdict, "why": outcome.why, "overruns": str(loop.overruns),
-                    "timing": outcome.timing_problem}}
+                    "timing": outcome.timing_problem,
+                    "sha256": hashlib.sha256(outcome.format_json().encode()).hexdigest()}}
     for name, values in notes.items():
         if values:
             recorder.metadata(name, values)

@@ -156,7 +156,7 @@ def test_bad_packages_are_refused_in_one_line(runs: Path, package: Path, tmp_pat
 def test_bad_input_of_packing_is_refused(runs: Path, tmp_path: Path) -> None:
     forgery = Path(shutil.copytree(runs / "run", tmp_path / "run"))
     verdict = json.loads((forgery / "verdict.json").read_text())
-    verdict["checks"][0]["value"] += 1.0
+    verdict["checks"][0]["high"] += 1.0
     (forgery / "verdict.json").write_text(json.dumps(verdict))
     (tmp_path / "other.csv").write_text("id\nREQ-1\n")
     (tmp_path / "broken").mkdir()
@@ -165,7 +165,7 @@ def test_bad_input_of_packing_is_refused(runs: Path, tmp_path: Path) -> None:
     out = ("--out", tmp_path / "x.zip")
     for words, line in (
             ((), "at least one folder of a run"), ((tmp_path / "none", *out), "the folder of a run or suite"),
-            ((forgery, *out), "verdict: expected what its log says, PASS, check by check"),
+            ((forgery, *out), "verdict: expected what its log says, PASS, check by check and byte"),
             ((tmp_path / "broken", *out), "the verdict of a run by this version"),
             ((runs / "run", "--out", runs / "run/x.zip"), "a place outside the runs"),
             ((runs / "run", "--out", runs / "pack"), "a FILE.zip, or a folder that is new or empty"),
