@@ -123,5 +123,4 @@ def compute_speed(position: NDArray[np.float64], rate: float) -> NDArray[np.floa
     """
     rows, half = np.arange(position.shape[-1]), max(1, round(SPEED_SPAN * rate / 2))
     ahead, behind = np.minimum(rows + half, len(rows) - 1), np.maximum(rows - half, 0)
-    speed: NDArray[np.float64] = (position[..., ahead] - position[..., behind]) * rate / (ahead - behind)
-    return speed
+    return (position[..., ahead] - position[..., behind]) * (rate / (ahead - behind))

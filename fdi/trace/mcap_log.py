@@ -155,6 +155,9 @@ def open_log(path: Path) -> Log:
             if summary is None:
                 raise InputError(path, "", "a complete MCAP log; this one was cut short: rig recover")
             _check_sizes(path, summary, file.size)
+            for index in summary.attachment_indexes:
+                require(file.has_checksum(index.offset, index.length), path, f"attachment {index.name}",
+                        "sound data (its checksum is wrong)")
             attachments = {item.name: item.data for item in reader.iter_attachments()}
             metadata = {item.name: item.metadata for item in reader.iter_metadata()}
     except OSError as error:
@@ -278,6 +281,12 @@ class BoundedFile:
         """Where the next byte is read."""
         return self._stream.tell()
 
+    def has_checksum(self, start: int, length: int) -> bool:
+        """Whether the attachment at these bytes has the checksum at its end; 0 is none. Raises EOFError."""
+        self.seek(start + _RECORD.size)
+        content = self.read(length - _RECORD.size)
+        return int.from_bytes(content[-4:], "little") in (0, zlib.crc32(content[:-4]))
+
 
 def unpack_chunk(chunk: Chunk) -> bytes:
     """The records in a chunk, its checksum verified.
@@ -304,8 +313,8 @@ def _unpack_zstd(packed: bytes, size: int) -> bytes:
         content_size = zstandard.get_frame_parameters(packed).content_size
         if content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
             raise UnpackingError(f"it declares {size} bytes, its zstd frame {content_size}")
-        unpacker = zstandard.ZstdDecompressor(max_window_size=2 * LARGEST_CHUNK)
-        return unpacker.decompress(packed, max_output_size=size) if size else b""
+        return zstandard.ZstdDecompressor(max_window_size=2 * LARGEST_CHUNK).decompress(
+            packed, max_output_size=size) if size else b""
     except zstandard.ZstdError as error:
         raise UnpackingError(str(error)) from error
 

@@ -70,7 +70,7 @@ class _Damage:
 
 
 def _list_intact_records(file: BoundedFile, damage: _Damage) -> Iterator[McapRecord | bytes]:
-    """The sound records of a log up to where it ends; a damaged chunk in the middle is left out.
+    """The sound records of a log up to where it ends; damaged chunks and attachments in the middle are left out.
 
     A chunk is given as the records in it, unpacked.
     """
@@ -79,7 +79,10 @@ def _list_intact_records(file: BoundedFile, damage: _Damage) -> Iterator[McapRec
         for record in StreamReader(cast(IO[bytes], file), emit_chunks=True, record_size_limit=file.size).records:
             start, at = at, file.tell()
             if not isinstance(record, Chunk):
-                yield record
+                if not isinstance(record, Attachment) or file.has_checksum(start, at - start):
+                    yield record
+                else:
+                    damage.reason, damage.lost = f"damaged file {record.name}", damage.lost + at - start
                 continue
             remaining_bytes -= record.uncompressed_size
             if remaining_bytes < 0:
