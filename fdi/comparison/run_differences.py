@@ -163,7 +163,8 @@ def _subtract(reference: Run, other: Run) -> RunPair:
     overlap, common = len(rows.t) * period, float(agrees.sum()) * period
     uncovered = max(len(a) * a.period, len(b) * b.period) - overlap
     uncovered = uncovered if uncovered > MOST_UNCOVERED * period else 0.0
-    is_same = len(rows.t) > 0 and bool(agrees.mean() > 0.995)  # missing rows and edges of interpolated steps aside
+    is_known = ~np.isnan(np.add(*rows.sample(a.declared.command.name)))
+    is_same = bool(is_known.any() and agrees[is_known].mean() > 0.995)  # edges of interpolated steps aside
     differences, signals, not_compared = {}, [], {}
     d = a.declared
     for name in (*a.output_names, d.drive.name, *([d.load.name] if d.load else [])):
@@ -183,7 +184,7 @@ def _subtract(reference: Run, other: Run) -> RunPair:
         signal = d.find(name)._replace(unit=a.units[name])
         signals.append(_measure_difference(signal, rows.t, difference, (first, second)))
     return RunPair(other, tuple(signals), is_same, common, overlap, uncovered, offset, rows.t, differences,
-                   not_compared, tuple(_list_notes(reference, other, offset, agrees, is_same)))
+                   not_compared, tuple(_list_notes(reference, other, offset, agrees[is_known], is_same)))
 
 
 def _find_obstacle(name: str, reference: Run, other: Run) -> str:

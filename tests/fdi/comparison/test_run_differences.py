@@ -86,9 +86,10 @@ def test_of_different_commands_only_equal_parts_are_compared() -> None:
 def test_missing_samples_signals_and_units_are_left_out() -> None:
     other = make_run(1)
     holes = np.where((np.arange(ROWS) >= 100) & (np.arange(ROWS) < 200), np.nan, other.xj)
-    other = other.with_columns({"xj": holes, "p12": np.full(ROWS, np.nan)}, units={**other.units, "cor": "rad/s"})
+    other = other.with_columns({"com": other.com + 0.0 * holes, "xj": holes, "p12": np.full(ROWS, np.nan)},
+                               units={**other.units, "cor": "rad/s"})
     _, pair, signals = compare_two(other)
-    assert list(signals) == ["xj"] and signals["xj"].samples == ROWS - 100
+    assert pair.has_same_command and list(signals) == ["xj"] and signals["xj"].samples == ROWS - 100
     assert pair.not_compared == {"p12": "only A has it", "cor": "in A in A, in rad/s in B"}
 
 
