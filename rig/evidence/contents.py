@@ -86,17 +86,18 @@ class Package(NamedTuple):
 
 
 def collect_runs(sources: Iterable[str]) -> Package:
-    """All runs in these folders, of single runs or of suites, with everything that lies in them.
+    """All runs in these folders, of single runs or of suites, each once, with everything that lies in them.
 
     Raises:
         InputError: a folder without a run, or a run whose verdict.json is not what its log says.
     """
     package = Package([], [], {}, {})
     bases: set[str] = set()
-    for source in map(Path, sources):
-        root = source.parent if source.name == "trace.mcap" else source
+    roots = {root.resolve(): root for source in map(Path, sources)
+             for root in [source.parent if source.name == "trace.mcap" else source]}
+    for root in (root for place, root in roots.items() if not roots.keys() & {*place.parents}):
         verdicts = sorted(root.rglob("verdict.json"))
-        require(verdicts, source, "", "the folder of a run or suite, with the verdict.json of a run in it")
+        require(verdicts, root, "", "the folder of a run or suite, with the verdict.json of a run in it")
         stem = root.resolve().name
         base = next(name for number in range(1, len(bases) + 2)
                     if (name := stem if number == 1 else f"{stem}-{number}") not in bases)

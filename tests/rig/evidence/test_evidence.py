@@ -50,8 +50,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert rig("run", folder / "short.toml", "--out", folder / "run", "--quiet").status == 0
     assert rig("run", folder / "suite.toml", "--out", folder / "suite", "--quiet").status == 0
     for out in ("pack", "pack.zip"):
-        assert rig("evidence", folder / "run", folder / "suite", "--requirements", folder / "req.csv", "--quiet",
-                   "--out", folder / out).status == 0
+        assert rig("evidence", folder / "run", folder / "run", folder / "suite", folder / "suite/short-seed-1",
+                   "--quiet", "--requirements", folder / "req.csv", "--out", folder / out).status == 0
     return folder
 
 
