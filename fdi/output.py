@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -54,13 +55,14 @@ def replace_text(path: str | Path, text: str) -> Path | None:
 
 @contextlib.contextmanager
 def write_whole(path: str | Path) -> Iterator[Path]:
-    """Give the path of a file to write, which takes the place of `path` at the end, if nothing went wrong.
+    """Give the path of a file or folder to make, which takes the place of `path` at the end, if nothing went wrong.
 
-    On a full disk, or after Ctrl-C, `path` is what it was before, and no part of a file is left. A device or pipe, and
-    a file in a folder that takes no new files, are written in place.
+    On a full disk, or after Ctrl-C, `path` is what it was before, and no part of it is left. A folder may only replace
+    an empty one. A device or pipe, and what lies in a folder that takes no new files, are written in place.
     """
     place = Path(os.path.realpath(path))
-    if (place.exists() and not place.is_file()) or not os.access(place.parent, os.W_OK):
+    can_be_replaced = place.is_file() or (place.is_dir() and not place.is_mount()) or not place.exists()
+    if not can_be_replaced or not os.access(place.parent, os.W_OK):
         yield place
         return
     part = place.with_name(f".part-{os.getpid()}-{place.name}")  # the suffix stays: it chooses the format
@@ -70,6 +72,8 @@ def write_whole(path: str | Path) -> Iterator[Path]:
             part.chmod(place.stat().st_mode & 0o7777)
         part.replace(place)
     except BaseException:
+        if part.is_dir():
+            shutil.rmtree(part)
         part.unlink(missing_ok=True)
         raise
 

@@ -115,8 +115,8 @@ class Command(NamedTuple):
 
 def find_work(name: str) -> Callable[[Any], int]:
     """Import the module of a command; give the function that does its work."""
-    module = import_module(f"rig.cli.commands.{name}{'_' if keyword.iskeyword(name) else ''}")
-    work: Callable[[Any], int] = module.run_command
+    work: Callable[[Any], int] = import_module(
+        f"rig.cli.commands.{name}{'_' if keyword.iskeyword(name) else ''}").run_command
     return work
 
 
@@ -346,7 +346,7 @@ COMMANDS = {
     "recover": Command(
         "recover a log whose writer was killed: keep all up to the last intact chunk and rebuild the index",
         "The log goes to --out (default: FILE with .recovered before its suffix).",
-        (option("file", metavar="FILE", help="the trace.mcap whose writer died"),)),
+        (option("file", metavar="FILE", help="the trace.mcap whose writer died"), FORCE)),
     "remove": Command(
         "remove an effect from a model file; with a TRACE, refit and show how the error grows",
         "The model goes to --out (default: the file of --model, in place).",

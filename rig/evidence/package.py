@@ -97,14 +97,14 @@ def write_package(contents: Mapping[str, bytes | Path], out: Path, key: str, pro
         file, signature = _sign(manifest, key)
         files[file] = partial(open_content, signature)
     with report_system_error("--out", str(out), "a place that can be written"):
-        if out.suffix == ".zip":
-            with write_whole(out) as part, part.open("wb") as handle:
-                _write_zip(files, handle.write)
-        else:
-            out.mkdir(parents=True, exist_ok=True)
-            for name, open_file in files.items():
-                (out / name).parent.mkdir(parents=True, exist_ok=True)
-                with open_file() as source, (out / name).open("xb") as target:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with write_whole(out) as part:
+            if out.suffix == ".zip":
+                with part.open("wb") as handle:
+                    _write_zip(files, handle.write)
+            for name, open_file in files.items() if out.suffix != ".zip" else ():
+                (part / name).parent.mkdir(parents=True, exist_ok=True)
+                with open_file() as source, (part / name).open("xb") as target:
                     shutil.copyfileobj(source, target)
     return hashlib.sha256(manifest).hexdigest()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import IO, cast
@@ -13,7 +13,7 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Chunk, McapRecord, Metadata
 from mcap.stream_reader import StreamReader
 
-from fdi.output import require_writable
+from fdi.output import require_writable, write_whole
 from fdi.trace import BoundedFile, read_declarations, scan_messages, unpack_chunk
 from plant import InputError, UnpackingError, count_nouns, limit_unpacked_size, report_system_error
 from rig.recorder.writer import McapFile
@@ -57,8 +57,9 @@ def recover_log(path: Path, out: Path) -> Salvage:
         if first is None:
             reason = damage.reason or "it is empty"
             raise InputError(path, "", f"an MCAP log with at least one intact record ({reason})")
-        with report_system_error(out, "--out", "a place that can be written"):
-            return _write_salvage(chain([first], records), damage, require_writable(out, "--out", source=path))
+        with (report_system_error(out, "--out", "a place that can be written"),
+              write_whole(require_writable(out, "--out", source=path)) as part):
+            return replace(_write_salvage(chain([first], records), damage, part), path=out)
 
 
 @dataclass

@@ -4,6 +4,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
+from fdi.output import require_new, require_writable
 from fdi.report import Report
 from rig.cli import give_answer
 from rig.recorder.recover import recover_log
@@ -12,6 +13,7 @@ from rig.recorder.recover import recover_log
 def run_command(args: argparse.Namespace) -> int:
     """The log goes to --out (default: FILE with .recovered before its suffix)."""
     source = Path(args.file)
-    out = Path(args.out) if args.out is not None else source.with_name(f"{source.stem}.recovered{source.suffix}")
+    out = (source.with_name(f"{source.stem}.recovered{source.suffix}") if args.out is None else
+           require_new(require_writable(args.out, "--out", source=source), is_forced=args.force))
     salvage = recover_log(source, out)
     return give_answer(Report("recover", str(source), sentence=str(salvage), data=asdict(salvage)), args)

@@ -90,13 +90,14 @@ def test_an_export_without_frames_leaves_what_was_there(sources: dict[str, Path]
 SMALLEST = 4096  # bytes that a file may have, as on a disk that is full then
 
 
-@pytest.mark.parametrize("name", ["run.csv", "run.mcap", "frames.asc"])
+@pytest.mark.parametrize("name", ["run.csv", "run.mcap", "frames.asc", "saved.mcap"])
 def test_a_full_disk_leaves_what_was_there_and_no_part(tmp_path: Path, name: str) -> None:
     record_run(tmp_path / "trace.mcap", stop=3000)
     Trace.read(tmp_path / "trace.mcap").write_csv(tmp_path / "in.csv")
     out = tmp_path / "out"
     out.mkdir()
-    words = ["import", f"{tmp_path}/in.csv"] if name == "run.mcap" else ["export", f"{tmp_path}/trace.mcap", "--force"]
+    words = ["import", f"{tmp_path}/in.csv"] if name == "run.mcap" else [
+        "recover" if name == "saved.mcap" else "export", f"{tmp_path}/trace.mcap", "--force"]
     words += ["--out", str(out / name)]
     for before in ({}, {name: b"before"}):
         for file, content in before.items():
@@ -107,23 +108,25 @@ def test_a_full_disk_leaves_what_was_there_and_no_part(tmp_path: Path, name: str
         assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_simulate_and_export_do_not_replace_a_file_unasked(sources: dict[str, Path], tmp_path: Path) -> None:
+def test_simulate_export_and_recover_do_not_replace_a_file_unasked(sources: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "s.csv"
     simulate = ["simulate", "--command", sources["command"], "--steps", "10", "--out", out, "--quiet"]
     assert rig(*simulate).status == 0
     first = out.read_bytes()
     assert "--force" in refuse(*simulate, "--seed", "1") and out.read_bytes() == first
     assert rig(*simulate, "--seed", "1", "--force").status == 0 and out.read_bytes() != first
-    export = ["export", str(out), "--out", str(tmp_path / "e.csv")]
-    assert [rig(*words).status for words in (export, export, [*export, "--force"])] == [0, 2, 0]
+    assert [rig(command, source, "--out", tmp_path / name, *force).status
+            for command, source, name in (("export", out, "e.csv"), ("recover", sources["log"], "r.mcap"))
+            for force in ((), (), ("--force",))] == [0, 2, 0] * 2
 
 
 def test_a_failure_in_the_middle_leaves_the_file_before(tmp_path: Path) -> None:
     place = tmp_path / "a.txt"
     write_text(place, "before")
     place.chmod(0o640)
-    with pytest.raises(ZeroDivisionError), write_whole(place) as part:
+    with pytest.raises(ZeroDivisionError), write_whole(place) as part, write_whole(tmp_path / "folder") as folder:
         part.write_text("half")
+        folder.mkdir()
         raise ZeroDivisionError
     assert place.read_text() == "before" and list(tmp_path.iterdir()) == [place]
     write_text(place, "after")
