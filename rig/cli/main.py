@@ -11,6 +11,7 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
+from io import TextIOWrapper
 from typing import Any, NoReturn
 
 from plant import RigError, escape_control_characters
@@ -80,6 +81,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         from rig.cli.completion import complete_line
 
         complete_line()
+    sys.stderr = sys.stderr or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")  # None where it is closed
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a character that its encoding lacks must not end a run
     gc.set_threshold(50_000)  # 0.05 s less: most objects are made while modules load, and stay
     leave_out_reader(sys.argv[1:])
     keep_memory()
@@ -140,6 +145,7 @@ def run_command_line(words: Sequence[str]) -> int:
     args = build_command_parser(name).parse_intermixed_args(words[1:])  # files may stand behind options
     status = 0
     try:
+        "".join(words).encode()  # a name that is not UTF-8 can stand in no log and on no page
         status = find_work(name)(args)
         print(end="", flush=True)  # here, so that a closed pipe is reported below; there may be no standard output
         return status
@@ -150,6 +156,8 @@ def run_command_line(words: Sequence[str]) -> int:
     except BrokenPipeError:  # whoever read our output has stopped reading: nothing to report, nobody to report it to
         discard_output()
         return status
+    except UnicodeEncodeError:
+        return _report_error(name, "expected names of files in UTF-8", 2)
     except Exception as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             discard_output()

@@ -152,17 +152,26 @@ def test_runs_without_a_folder_get_new_ones(short: Path, here: Path) -> None:
     assert traces == ["runs/short/trace.mcap", "runs/short-2/trace.mcap"]
 
 
-@pytest.mark.parametrize("how", ["closed", "reader gone"])
-def test_output_that_nobody_reads_changes_no_verdict(how: str, short: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [1, 2, "reader gone"])
+def test_output_that_nobody_reads_changes_no_verdict(how: int | str, short: Path, tmp_path: Path) -> None:
     words = ["run", short, "--out", tmp_path / "out"]
-    if how == "closed":
-        process = started(*words, stdout=None, preexec_fn=lambda: os.close(1))
+    if isinstance(how, int):
+        process = started(*words, stdout=None, preexec_fn=lambda: os.close(how))
     else:
         process = started(*words)
         process.stdout.close()
         process.stdout = None
     result = finished(process)
     assert (result.status, result.err) == (0, "") and (tmp_path / "out" / "verdict.json").exists()
+
+
+@pytest.mark.parametrize("name", ["PYTHONIOENCODING", "COLUMNS"])
+def test_an_odd_terminal_and_odd_names_end_no_command(name: str, here: Path) -> None:
+    write_file(here / "ü.csv", "t,com\n0,0\n0.001,0\n0.002,0\n")
+    result = finished(started("simulate", "--command", "ü.csv", "--out", "ä.csv", env={
+        **os.environ, name: {"COLUMNS": "0"}.get(name, "ascii")}))
+    assert (result.status, result.err, "csv" in result.out) == (0, "", True)
+    assert "names of files in UTF-8" in refuse("simulate", "--command", "\udcfc.csv")
 
 
 def test_the_installed_command_is_this_one() -> None:

@@ -202,10 +202,10 @@ def test_damage_in_the_middle_costs_one_chunk(log: Path, tmp_path: Path) -> None
 
 
 def test_a_changed_attachment_is_refused_and_left_out_of_a_salvage(log: Path, tmp_path: Path) -> None:
-    path = write_file(tmp_path / "bad.mcap", "")
-    path.write_bytes(log.read_bytes().replace(b"'synthetic'", b"'Synthetic'"))
-    assert "attachment sequence.toml: expected sound data (its checksum is wrong)" in catch_refusal(Trace.read, path)
-    assert "damaged file sequence.toml" in str(recover_log(path, tmp_path / "out.mcap"))
+    (tmp_path / "bad.mcap").write_bytes(log.read_bytes().replace(b"'synthetic'", b"'Synthetic'"))
+    assert ("attachment sequence.toml: expected sound data (its checksum is wrong)" in
+            catch_refusal(Trace.read, tmp_path / "bad.mcap") and
+            "damaged file sequence.toml" in str(recover_log(tmp_path / "bad.mcap", tmp_path / "out.mcap")))
 
 
 def test_a_whole_log_stays_the_same(log: Path, tmp_path: Path) -> None:
