@@ -2,6 +2,7 @@
 
 from .check_result import (
     PROTOCOL as PROTOCOL,
+    SPEED_SPAN as SPEED_SPAN,
     CheckResult as CheckResult,
     compute_speed as compute_speed,
     describe_field as describe_field,

@@ -116,11 +116,11 @@ def filter_median(signal: NDArray[np.float64], rate: float) -> NDArray[np.float6
     return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=-1), axis=-1)
 
 
-def compute_speed(position: NDArray[np.float64], rate: float) -> NDArray[np.float64]:
-    """Central difference, (.., n), time last, of two samples or more over SPEED_SPAN, one-sided at the ends, m/s.
+def compute_speed(position: NDArray[np.float64], rate: float, span: float = SPEED_SPAN) -> NDArray[np.float64]:
+    """Central difference, (.., n), time last, of two samples or more over `span` s, one-sided at the ends, m/s.
 
     At least one cycle to each side. A spike of one sample becomes two of one sample each, so it does not last either.
     """
-    rows, half = np.arange(position.shape[-1]), max(1, round(SPEED_SPAN * rate / 2))
+    rows, half = np.arange(position.shape[-1]), max(1, round(span * rate / 2))
     ahead, behind = np.minimum(rows + half, len(rows) - 1), np.maximum(rows - half, 0)
     return (position[..., ahead] - position[..., behind]) * (rate / (ahead - behind))

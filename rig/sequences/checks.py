@@ -8,13 +8,13 @@ when the check is read. On a run a check never raises: what cannot be measured h
 from cmath import phase
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import degrees, inf, isfinite, nan
+from math import degrees, hypot, inf, isfinite, nan
 from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace import CheckResult, compute_speed, filter_median
+from fdi.trace import SPEED_SPAN, CheckResult, compute_speed, filter_median
 from plant import (
     EHA,
     LONGEST,
@@ -190,6 +190,7 @@ class RunData:
     rate: float = RATE
     signals: Signals = EHA  # of the plant
     metrology: Metrology = NO_METROLOGY
+    speed_span: float = SPEED_SPAN  # s
 
     def find_start(self, after: str | float) -> float:
         """The start of the cycle nearest to a time, s of main, or in which the fault of a label begins."""
@@ -216,7 +217,7 @@ class RunData:
             return self.read_signal(command, span) - self.read_signal(controlled, span)
         if name == "speed" and name not in self.signals.names:
             require_measurable(span.stop - span.start >= 2, "one sample has no speed")
-            return compute_speed(self.read_signal(controlled, span), self.rate)
+            return compute_speed(self.read_signal(controlled, span), self.rate, self.speed_span)
         require_measurable(hasattr(self.trace, name), f"the plant has no signal {name}")
         return bridge_gaps(np.asarray(getattr(self.trace, name), float)[span], name, largest_missing_share)
 
@@ -345,9 +346,9 @@ class Check:
 
     def _compute_uncertainty(self, run: RunData, span: slice, value: float) -> tuple[float, str]:
         """U of the number, NaN if it is not known, and what is wrong with the calibrations that it depends on."""
-        def measure(trace: Columns) -> float:
+        def measure(trace: Columns, speed_span: float = SPEED_SPAN) -> float:
             try:
-                return self._measure(replace(run, trace=trace), span)
+                return self._measure(replace(run, trace=trace, speed_span=speed_span), span)
             except (NotMeasurable, ArithmeticError, ValueError):
                 return nan
 
@@ -358,7 +359,9 @@ class Check:
         if missing and not (self.kind == "python" and calibration):  # which columns a function reads is not known
             return nan, f"no calibration of {', '.join(missing)}"
         step = 1 / run.rate / self.scale if KINDS[self.kind].is_rounded else 0.0
-        uncertainty = compute_expanded_uncertainty(measure, value, run.trace, names, run.metrology, step)
+        # what the span takes from a peak grows with its square: half of it takes a quarter
+        blur = 4 / 3 * abs(value - measure(run.trace, SPEED_SPAN / 2)) if self.about == "speed" else 0.0
+        uncertainty = compute_expanded_uncertainty(measure, value, run.trace, names, run.metrology, hypot(step, blur))
         open_ = ["errors of the sensor decide whether it can be measured"] if uncertainty == inf else []
         return uncertainty, "; ".join([*(run.metrology.problems[name] for name in names
                                          if name in run.metrology.problems), *open_])

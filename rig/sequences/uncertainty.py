@@ -63,7 +63,7 @@ def compute_expanded_uncertainty(measure: Callable[[Columns], float], value: flo
         trace: the columns as read, SI.
         names: signals that it depends on.
         metrology: calibrations and counts.
-        step: s, of the samples to which a time is rounded; 0: the number is not.
+        step: half-width of a rectangular error, such as that of a time in samples, in the unit of the number.
 
     Returns:
         In the unit of the number. Infinite if more than 5 % of the errors decide whether it can be measured at all.
