@@ -434,9 +434,9 @@ class Response(Check):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(bool(self.event) != (self.signal is not None), "check", "event", "either an event or a signal")
-        levelled = self.above is not None or self.below is not None
-        require(levelled == (self.signal is not None), "check", "signal",
-                      "a signal with a level above or below which it counts")
+        levels = (self.above is not None) + (self.below is not None)
+        require(levels == (self.signal is not None), "check", "signal",
+                "a signal with a level above or below which it counts, one of them")
 
 
 @dataclass(frozen=True, kw_only=True)

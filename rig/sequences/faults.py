@@ -108,6 +108,7 @@ class Noise(Offset):
     """A sensor has more white noise: `value` is its standard deviation."""
 
     kind = "noise"
+    value: Annotated[float, Quantity("SI units", low=0.0, high=LARGEST_VALUE)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,8 +304,8 @@ class Plan:
 
     def to_json(self) -> dict[str, Any]:
         """What `from_json` makes a plan of: plain dicts, lists, numbers and texts."""
-        faults = [{"kind": f.kind, **{k: v for k, v in asdict(f).items() if v is not None}} for f in self.faults]
-        return {"faults": faults, "start": self.start, "stop": self.stop, "seed": self.seed,
+        return {"faults": [{"kind": f.kind, **{k: v for k, v in asdict(f).items() if v is not None}}
+                           for f in self.faults], "start": self.start, "stop": self.stop, "seed": self.seed,
                 "rate": self.rate}
 
     @classmethod

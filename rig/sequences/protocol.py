@@ -183,8 +183,8 @@ def _make_result(name: str, signal: str, value: float, unit: str, low: float = n
 
 def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
     """Largest current while it must be zero; and in all cycles."""
-    rate = record.bench.rate
-    idle = _drop_missing([rows.drive[find_idle(rows, record.words, limits, rate)] for rows in record.stretches])
+    idle = _drop_missing([rows.drive[find_idle(rows, record.words, limits, record.bench.rate)]
+                          for rows in record.stretches])
     drive = record.bench.signals.drive
     idle_name, limit_name = f"no {drive.phrase} unless {record.words.active}", f"{drive.phrase} within its limit"
     is_always_active = all(_find_active(rows, record.words).all() for rows in record.stretches)
@@ -192,8 +192,8 @@ def _judge_current(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[C
         yield SkippedCheck(idle_name, "the bench has no control word, and no value of its phases in this run disables "
                                       "the controller")
     else:
-        largest = limits.idle_current + record.bench.find_least(drive.word)
-        yield _judge_largest(idle_name, drive, idle, largest, f"{len(idle)} cycles")
+        yield _judge_largest(idle_name, drive, idle, limits.idle_current + record.bench.find_least(drive.word),
+                             f"{len(idle)} cycles")
     if isnan(record.drive_limit):
         yield SkippedCheck(limit_name, "the plant declares no limit of it")
     else:
@@ -354,8 +354,7 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
         missing += int(is_missing.sum())
         cycles += int(is_judged.sum())
     specs = record.bench.frames.list_from(Role.CONTROLLER)
-    is_numbered = any(spec.has("cycle") for spec in specs)
-    for name, count, can_be_told in (("drive frames of another cycle", wrong, is_numbered),
+    for name, count, can_be_told in (("drive frames of another cycle", wrong, any(s.has("cycle") for s in specs)),
                                      ("drive frames missing or late", missing, True)):
         if can_be_told:
             value = 100 * count / cycles if cycles else 0.0

@@ -182,8 +182,7 @@ class Sequence:
     def load_profile(self) -> Array:
         """The load, SI, for every cycle of main."""
         force, _, end = build_profile(self.load, rate=self.rate)
-        cycles = round(self.duration * self.rate)
-        return np.concatenate((force, np.full(cycles - len(force), end)))
+        return np.concatenate((force, np.full(round(self.duration * self.rate) - len(force), end)))
 
     def plan(self, seed: int) -> Plan:
         """The faults by cycle of the run."""
@@ -194,8 +193,8 @@ class Sequence:
     @property
     def loses_frames(self) -> bool:
         """Whether a fault keeps frames from arriving."""
-        lossy = (faults.Lost, faults.Late, faults.Corrupted, faults.Short, faults.BusOff, faults.Reset)
-        return any(isinstance(fault, lossy) for fault in self.faults)
+        return any(isinstance(fault, (faults.Lost, faults.Late, faults.Corrupted, faults.Short, faults.BusOff,
+                                      faults.Reset)) for fault in self.faults)
 
     @property
     def disturbs_bus(self) -> bool:
@@ -318,8 +317,8 @@ def write_preflight(kind: Plant) -> str:
     """
     command = kind.build_nominal_command()
     span = float(f"{np.ptp(np.append(command, 0.0)):.3g}")
-    rest = list_section_names(kind.profile)[-1] if isinstance(kind.profile[-1], Hold) else ""
-    return fill_template("sequences/preflight.jinja", kind=kind, span=span, rest=rest, most_error=MOST_FOLLOWING_ERROR)
+    return fill_template("sequences/preflight.jinja", kind=kind, span=span, most_error=MOST_FOLLOWING_ERROR, rest=(
+        list_section_names(kind.profile)[-1] if isinstance(kind.profile[-1], Hold) else ""))
 
 
 def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Sequence:
@@ -363,8 +362,8 @@ def _read_column(file: str, read: Callable[[str, Place, str], bytes], phase: str
         raise here.refuse(f"{expected}; {error}") from error
     values = columns.get("value" if phase == "load" or "com" not in columns else "com")
     if values is None:
-        command = find_tested().command.name
-        raise here.refuse(f"a file with the columns t and {'value' if phase == 'load' else command}")
+        raise here.refuse("a file with the columns t and "
+                          f"{'value' if phase == 'load' else find_tested().command.name}")
     return tuple(values.tolist())
 
 
@@ -455,8 +454,8 @@ def _check_checks(sequence: Sequence, place: Place) -> None:
     name_counts = Counter(check.name for check in sequence.checks)
     for i, check in enumerate(sequence.checks):
         window, after = check.window, getattr(check, "after", 0.0)
-        place.at(i, "name").require(name_counts[check.name] == 1,
-                                    f"a name used once, not {name_counts[check.name]} times {check.name!r}")
+        place.at(i, "name").require(check.name and name_counts[check.name] == 1, "a name used once, not "
+                                    f"{name_counts[check.name]} times {check.name!r}" if check.name else "a name")
         is_known = not isinstance(window, str) or window == MAIN or window in sections
         place.at(i, "window").require(is_known, f"a section: {tables.list_choices(window, [MAIN, *sections])}")
         if isinstance(window, tuple) and window[1] > sequence.duration + 0.5 / sequence.rate:
@@ -464,8 +463,25 @@ def _check_checks(sequence: Sequence, place: Place) -> None:
         frequency = getattr(check, "frequency", 0.0)
         place.at(i, "frequency").require(frequency < sequence.rate / 2,
                                          f"below half the rate of {sequence.rate:g} Hz, not {frequency:g}")
-        place.at(i, "after").require(not isinstance(after, str) or labels[after] == 1,
-                                     f"a time or one fault: {tables.list_choices(after, labels)}")
+        begin, end = window if isinstance(window, tuple) else (0.0, sequence.duration)
+        bands = [band for segment, (name, rows) in zip(sequence.main, sections.items(), strict=True)
+                 if (name == window or window == MAIN or isinstance(window, tuple))
+                 and rows.start < end * sequence.rate and begin * sequence.rate < rows.stop
+                 for band in _list_bands(segment, sequence.rate / (2 * (rows.stop - rows.start)))]
+        place.at(i, "frequency").require(not frequency or any(low <= frequency <= high for low, high in bands),
+                                         f"one that the command has in this window, not {frequency:g}")
+        place.at(i).require(check.kind != "recovers" or sequence.cleanup, "a clean-up, in which to recover")
+        place.at(i, "after").require(labels[after] == 1 if isinstance(after, str) else after < sequence.duration,
+                                     f"a time within main's {sequence.duration:g} s" + (
+                                         f" or one fault: {tables.list_choices(str(after), labels)}" if labels else
+                                         f", not {after!r}"))
+
+
+def _list_bands(segment: Segment, half_line: float) -> list[tuple[float, float]]:
+    """The bands of the frequencies in a segment, Hz, wider by `half_line`; all where no key names them."""
+    values = np.ravel([getattr(segment, key) for key in segment.frequencies_in]).tolist()
+    pairs = [(min(values), max(values))] if segment.kind == "chirp" else [(each, each) for each in values]
+    return [(low - half_line, high + half_line) for low, high in pairs] or [(0.0, np.inf)] * (segment.kind != "hold")
 
 
 def load_nominal_test(kind: Plant, period: float) -> tuple[Array, Array | None, str]:
