@@ -39,7 +39,7 @@ class Salvage:
                    f"{self.duration:.3f} s, {count_nouns(len(self.attachments), 'file')}")
         if self.complete:
             return f"{self.path}: the log was complete: {content}"
-        return (f"{self.path}: kept {content}; lost {self.lost_bytes} bytes without an intact chunk ({self.reason}) "
+        return (f"{self.path}: kept {content}; lost {self.lost_bytes} bytes of the file ({self.reason}) "
                 f"and data not yet written, at most about 0.25 s")
 
 

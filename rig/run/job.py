@@ -355,6 +355,8 @@ def build_job(choice: JobChoice, sequence: Sequence | None = None, *, is_trusted
     Raises:
         InputError: a sequence, model, effect or value that cannot be used.
     """
+    require(isinstance(choice.seed, int) and 0 <= choice.seed < 1 << 63, "--seed", str(choice.seed),
+            "a whole number from 0 and below 2^63")
     require_different_names(choice.effects)
     bench, model, effect_files = load_tested_model(choice, is_trusted=is_trusted, announce=announce)
     sequence = load_sequence(choice.sequence, bench.rate, model.plant) if sequence is None else sequence

@@ -108,7 +108,7 @@ class BenchRun:
         if not failed_checks and (names or self.verdict in ("PASS", "NOT_JUDGED")):
             return
         title = self.outcome.job.sequence.title
-        lines = [f"{title}: {len(failed_checks)} of {len(checks)} checks failed" if failed_checks else
+        lines = [f"{title}: {len(failed_checks)} of {len(checks)} checks not passed" if failed_checks else
                  f"{title}: {self.verdict}, {self.why}", *map(describe_failure, failed_checks)]
         close_ups = [picture for check in failed_checks[:3] if (picture := self.write_close_up(check.name)) is not None]
         pictures = [f"picture: {picture}" for picture in close_ups or [self.write_picture()]]

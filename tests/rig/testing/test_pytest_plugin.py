@@ -60,7 +60,7 @@ def test_a_project_with_the_fixture(project: pytest.Pytester) -> None:
     result.assert_outcomes(passed=6, failed=2)
     result.stdout.fnmatch_lines(["test_example.py ...*", "test_mine.py .F.F.*"])
     result.stdout.re_match_lines([
-        r"E +.*CheckFailedError: Command from Python: 1 of 11 checks failed",
+        r"E +.*CheckFailedError: Command from Python: 1 of 11 checks not passed",
         r"E +overshoot: measured [\d.]+ %, limits <= 1 %, 0\.050 to 0\.250 s, requirement R-1",
         r"E +picture: .*out/test_mine\.py-test_fails/run-2/check-overshoot\.svg",
         r"E +page: .*out/test_mine\.py-test_fails/run-2/report\.html",
