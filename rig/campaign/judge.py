@@ -568,7 +568,9 @@ def write_results(folder: str | Path, rows: Iterable[Row]) -> None:
     pa, parquet = import_extra("pyarrow"), import_extra("pyarrow.parquet")
     path, newest = Path(folder) / RESULTS, select_newest(rows)
     names = list(dict.fromkeys(name for row in newest for name in row))
-    table = pa.table({name: pa.array([row.get(name) for row in newest]) for name in names})
+    # Parquet has no table without fields: where nobody has precursors, the column is empty
+    table = pa.table({name: pa.array([None if row.get(name) == {} else row.get(name) for row in newest])
+                      for name in names})
     table = table.replace_schema_metadata({"campaign": json.dumps(_read_campaign(Path(folder)))})
     with write_whole(path) as part:
         parquet.write_table(table, part)

@@ -239,7 +239,7 @@ def test_a_plant_file_is_judged_by_worker_processes_and_resumed_only_with_trust(
     work = ("--work", "campaign_work:count_rows")
     rig("campaign", "--model", "my_motor.py", "--fault", "healthy", "--seeds", 3, "--out", "two", "--jobs", 2,
         "--most", 2, *work)
-    case_rows = rows(here / "two")
+    case_rows = rows(here / "two" / judge.RESULTS)
     fault, = judge.restore_faults(judge.read_matrix_of_folder("two").spec)
     assert [row["status"] for row in case_rows] == ["ok", "ok"]
     truth = {row[f"true_{fault.key}"] for row in case_rows}
