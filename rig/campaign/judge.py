@@ -42,6 +42,7 @@ from plant import (
     count_threads,
     find_effect,
     find_quantity,
+    list_offered_effects,
     load_nominal_values,
     load_plant,
     parse_model,
@@ -51,6 +52,7 @@ from plant import (
     report_system_error,
     require,
     simulate,
+    suggest_name,
 )
 from rig.campaign.batch import Batch, BatchProgress, Row, RowFile, Workers, import_extra, read_rows, run_batch
 from rig.network import WallClock
@@ -160,23 +162,33 @@ def _parse_block(block: Mapping[str, Any], common: Mapping[str, Any], model: Mod
     own = {key: value for key, value in block.items() if key in ("seeds", "tolerance")}
     settings = build_dataclass(Settings, {**common, **own}, place).list_values()
     sizes = {}
-    for name, values in block.items():
-        if name not in own:
-            with place.at(name).locate():
-                quantity = _find_size(name, model, faults)
-                sizes[name] = [parse_value("", name, quantity, value)
+    for key, values in block.items():
+        if key not in own:
+            with place.at(key).locate():
+                name, quantity = _find_size(key, model, faults)
+                require(name not in sizes, "", key, f"one size for {name}, not two")
+                sizes[name] = [parse_value("", key, quantity, value)
                                for value in (values if isinstance(values, list) else [values])]
-                require(sizes[name], "", name, "at least one size")
+                require(sizes[name], "", key, "at least one size")
     return {"seeds": settings["seeds"], "sizes": sizes, "tolerance": settings["tolerance"]}
 
 
-def _find_size(name: str, model: Model, faults: Sequence[Fault]) -> Quantity:
-    """What the size of a fault, or of an effect by its first parameter, is. Raises InputError."""
-    if (own := next((fault for fault in faults if fault.name == name), None)) is not None:
-        return find_quantity(own.parameter, plant=model.plant)
-    effect = find_effect(name, model.plant)
-    require(effect.fitted, "", name, "an effect with a size; this one is noise of the bench")
-    return effect.parameters[effect.fitted[0]]
+def _find_size(key: str, model: Model, faults: Sequence[Fault]) -> tuple[str, Quantity]:
+    """The name of the fault or effect of that name, and what its size is: its parameter, of an effect the first one.
+
+    The parameter of a fault, and an effect that has it, name the fault, so that the size is a true size of the fault.
+
+    Raises:
+        InputError: neither a fault nor an effect, or an effect without a size.
+    """
+    own = {fault.parameter: fault.name for fault in faults}
+    effects = {e.name: (*e.fitted, "")[0] for e in list_offered_effects(model.plant)}
+    parameters = {**dict(zip(own, own, strict=True)), **effects, **{name: first for first, name in own.items()}}
+    require(key in parameters, "", key, f"a fault ({', '.join(own.values())}) or an effect of the catalogue"
+            f"{suggest_name(key, parameters, 0.5) or ' (rig effects lists them)'}")
+    parameter = parameters[key]
+    require(parameter, "", key, "an effect with a size; this one is noise of the bench")
+    return own.get(parameter, key), find_quantity(parameter, plant=model.plant)
 
 
 def restore_faults(spec: Mapping[str, Any]) -> tuple[Fault, ...]:
@@ -344,20 +356,23 @@ def add_faults(model: Model, sizes: Mapping[str, float], faults: Sequence[Fault]
     The effect's further parameters follow: of a parameter of the base model in proportion to the first one (dynamic
     friction to static friction), of an added effect as in the start whose first parameter is nearest to the size.
     """
-    faults_by_name = {fault.name: fault for fault in faults if tuple(faults) != FAULTS}
     for name, size in sizes.items():
-        if name in faults_by_name:
-            model = model.replace(faults_by_name[name].list_changes(size), name)
-            continue
-        effect = find_effect(name, model.plant)
-        first, *others = effect.fitted
-        if effect.base:
-            changes = {other: model[other] * size / model[first] for other in others}
-        else:
-            starts = sorted(effect.starts, key=lambda start: abs(start[first] - size))
-            changes = {other: starts[0][other] for other in others if starts}
-        model = model.replace(changes | {first: size}, name)
+        model = model.replace(_list_changes(name, size, model.values, model.plant, faults), name)
     return model
+
+
+def _list_changes(name: str, size: float, values: Mapping[str, float], plant: str, faults: Sequence[Fault]
+                  ) -> dict[str, float]:
+    """The parameters that a fault or effect of that size changes in a unit with these values, SI."""
+    faults_by_name = {fault.name: fault for fault in faults if tuple(faults) != FAULTS}
+    if name in faults_by_name:
+        return faults_by_name[name].list_changes(size)
+    effect = find_effect(name, plant)
+    first, *others = effect.fitted
+    if effect.base:
+        return {first: size, **{other: values[other] * size / values[first] for other in others}}
+    starts = sorted(effect.starts, key=lambda start: abs(start[first] - size))
+    return {first: size, **{other: starts[0][other] for other in others if starts}}
 
 
 OK, REFUSED, FAILED = "ok", "refused", "failed"
@@ -393,10 +408,10 @@ def describe_case(case: Case, spec: Mapping[str, Any]) -> Row:
         return row
     model = _parse_healthy_model(spec)
     scatter, _ = sample_scatter(case, model.kind)
-    usual = {name: factor * model[name] for name, factor in scatter.items()}
-    return row | {f"true_{fault.key}": case.sizes.get(
-        fault.name, usual.get(fault.parameter, model.values.get(fault.parameter, fault.healthy)))
-        for fault in restore_faults(spec)}
+    faults, values = restore_faults(spec), {**model.values, **{name: f * model[name] for name, f in scatter.items()}}
+    for name, size in case.sizes.items():
+        values |= _list_changes(name, size, values, model.plant, faults)
+    return row | {f"true_{fault.key}": values.get(fault.parameter, fault.healthy) for fault in faults}
 
 
 def _load_judgement(spec: Mapping[str, Any]) -> Callable[..., Row]:

@@ -23,7 +23,7 @@ from rig_command import answer, finished, grown, is_running, refuse, rig, starte
 from fdi.estimation import measure_share
 from fdi.report import format_report
 from fdi.trace import Trace
-from plant import Model, RigError
+from plant import Fault, Model, RigError, find_plant, place_faults
 from plant.effects import CATALOGUE
 from rig.campaign import batch, judge, summary as campaign_summary
 from rig.campaign.batch import BatchProgress, RowFile, Workers, run_in_processes, run_jobs
@@ -154,7 +154,9 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     (tmp_path / "notes.txt").write_text("mine")
     for words, line in (((*MATRIX, "--seeds", 4, "--out", local),
                          "a folder of this matrix, or a new one; it differs in seeds, case"),
-                        ((*MATRIX, "--out", tmp_path), "an empty folder")):
+                        ((*MATRIX, "--out", tmp_path), "an empty folder"),
+                        (("--fault", "coil.resistance=5"),
+                         "expected a fault (filter_clogging, spool_friction) or an effect of the catalogue")):
         assert line in refuse("campaign", *words)
     whole, sources = judge.read_matrix_of_folder(local), judge.hash_campaign_sources()
     assert "the code has changed" in catch_refusal(judge.open_campaign, local, whole, "another")
@@ -190,6 +192,17 @@ def test_a_matrix_file_says_the_same_as_options_and_any_beginning_is_a_fair_samp
     shipped = judge.build_matrix(judge.read_matrix("statistics"), Model(), "fdi", "statistics")
     labels = Counter(c.label for c in shipped.cases)
     assert len(shipped.cases) >= 500 and labels["healthy"] >= 200 and labels[campaign_summary.OFF_GRID] >= 200
+
+
+@pytest.mark.parametrize(("word", "label", "sizes"), [
+    ("clog=0.3", "clog=0.3", [0.3, 10.0 / 3.0]), ("filter_clogging=0.3", "clog=0.3", [0.3, 10.0 / 3.0]),
+    ("filter.clogging=0.3", "clog=0.3", [0.3, 10.0 / 3.0]), ("spool_friction=45", "spool_friction=45", [0.0, 30.0])])
+def test_a_true_size_is_recorded_whatever_names_the_fault(word: str, label: str, sizes: list[float]) -> None:
+    faults = place_faults([Fault("clog", "", "filter.clogging", (0.0, 0.9), 0.25, 0.35, symbol="kx"),
+                           Fault("rub", "", "spool.dynamic_friction", (0.0, 99.0), 20.0, 50.0)], find_plant("eha"))
+    matrix = judge.build_matrix({"tolerance": 0.0, "case": judge.parse_faults([word])}, Model(), "", "x", faults)
+    row = judge.describe_case(matrix.cases[0], matrix.spec)
+    assert row["label"] == label and [row[f"true_{fault.key}"] for fault in faults] == pytest.approx(sizes)
 
 
 def test_a_case_depends_on_its_own_seed_alone_and_hides_what_it_says() -> None:
