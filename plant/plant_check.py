@@ -172,16 +172,16 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
     if worst := max(errors, key=lambda name: errors[name], default=""):
         yield Finding("step", errors[worst] < MOST_STEP_ERROR, f"half the step changes {worst} by "
                       f"{100 * errors[worst]:.2g} % of its range (limit {100 * MOST_STEP_ERROR:g} %)")
-    target = np.full(2 * PUSHED_ROWS, 0.1 * np.ptp(once[kind.signals.controlled.name]))
+    wanted = 0.1 * np.ptp(once[kind.signals.controlled.name])
     push = np.repeat([np.abs(once[kind.signals.drive.name]).max(), 0.0], PUSHED_ROWS)
     idle, lanes = 0.0 * push, Lanes(quiet, ())
-    idle_path, moved_path, pushed_path = (lanes.replay(np.empty((1, 0)), drive, idle, position)[0, :, 0]
-                                          for drive, position in ((idle, None), (idle, target), (push, None)))
-    distance = (moved_path - idle_path)[-1]
-    is_moved = bool(abs(distance - target[0]) <= MOST_STRAY * target[0]
-                    or abs(pushed_path[-1]) < MOST_STRAY * abs(pushed_path[PUSHED_ROWS]))  # it springs back
+    idle_path, pushed_path = (lanes.replay(np.empty((1, 0)), drive, idle)[0, :, 0] for drive in (idle, push))
+    moved_path = lanes.replay(np.empty((1, 0)), idle, idle, idle_path + wanted)[0, :, 0]
+    distance, pushed = (moved_path - idle_path)[-1], np.abs(pushed_path - idle_path)
+    is_moved = bool(abs(distance - wanted) <= MOST_STRAY * wanted
+                    or pushed[-1] < MOST_STRAY * pushed[PUSHED_ROWS])  # it springs back
     yield Finding("moves", is_moved, "the plant stays where a replay moves it" if is_moved else
-                  f"moved by {target[0]:.3g} {kind.signals.controlled.unit}, the plant goes to {distance:.3g}: "
+                  f"moved by {wanted:.3g} {kind.signals.controlled.unit}, the plant goes by {distance:.3g}: "
                   "every field of the state has to move along, a motor's angle by the gear ratio")
     error = rms(once[kind.signals.command.name] - once[kind.signals.controlled.name]) / max(np.ptp(command), 1e-300)
     yield Finding("control", error < MOST_FOLLOWING_ERROR, f"following error {100 * error:.2g} % of the command's "
