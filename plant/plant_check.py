@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from plant.plants import Plant
 
 MOST_STEP_ERROR = 0.01  # RMS change of an output with half the step, over its range in the nominal test
+MOST_STEP_NOISE = 0.5  # the same over its noise: half the step halves the error, so all of it is at most the noise
 PUSHED_ROWS = 200  # cycles; then as many without a drive
 MOST_STRAY = 0.5  # of a distance: a spring has taken the plant back, or a field of its state did not move along
 MOST_FOLLOWING_ERROR = 0.5  # RMS, over the range of the command
@@ -32,9 +33,6 @@ def check_declaration(plant: Plant, where: object) -> None:
     Raises:
         InputError: the field of the declaration and what was expected there.
     """
-    for signal in plant.signals:
-        require(isinstance(signal.unit, str) and bool(signal.unit), where, f"signal {signal.name}",
-                'a unit, "1" for none')
     _check_parameters(plant, where)
     require(isinstance(plant.state, type) and hasattr(plant.state, "_fields"), where, "state",
             "a NamedTuple of floats, class State(NamedTuple)")
@@ -44,14 +42,17 @@ def check_declaration(plant: Plant, where: object) -> None:
     for name, counts in ARGUMENTS.items():
         function = getattr(plant, name)
         if name == "moves" and not callable(function):
-            unknown = [f for f in function if f not in plant.state._fields]
-            require(not unknown, where, "moves",
-                    f"fields of the state ({', '.join(plant.state._fields)}), not {unknown[:1]}")
+            require(set(function) <= set(plant.state._fields), where, "moves",
+                    f"fields of the state ({', '.join(plant.state._fields)}), not {', '.join(map(str, function))}")
         elif function is not None or name in ("step", "measure"):
             require(callable(function) and len(inspect.signature(function).parameters) in counts, where, name,
                     f"a function of {' or '.join(map(str, counts))} arguments")
     names = {f"{group}.{name}" for group, cls in plant.parameters.items() for name in cls._fields}
     for signal in plant.signals:
+        require(isinstance(signal.unit, str) and bool(signal.unit), where, f"signal {signal.name}",
+                'a unit, "1" for none')
+        require(signal.largest > 0.0, where, f"signal {signal.name}, largest",
+                f"a number above 0 {signal.unit}, not {signal.largest:g}")
         for use, name in (("noise", signal.noise), ("limit", signal.limit)):
             require(not name or name in names, where, f"signal {signal.name}, {use}", f"a parameter, not {name!r}")
     for e in plant.effects.values():
@@ -70,8 +71,10 @@ def check_declaration(plant: Plant, where: object) -> None:
         require(isinstance(fault, Fault), where, "faults", "values Fault(...)")
         require(fault.parameter in names, where, f"fault {fault.name}, parameter",
                 f"a parameter of the plant or of an effect{suggest_name(fault.parameter, names)}")
-    require(all(isinstance(s, Segment) for s in plant.profile), where, "profile",
-            "segments such as Step(to=1e-3, time=1.0)")
+    require(all(isinstance(s, Segment) for s in plant.profile) and np.isfinite(plant.build_nominal_command()).all(),
+            where, "profile", "segments such as Step(to=1e-3, time=1.0), of finite numbers")
+    require(0.0 < plant.solver_step <= plant.nominal["controller.period"], where, "solver_step",
+            f"above 0 s and at most controller.period, not {plant.solver_step:g}")
     _check_readings(plant, where)
 
 
@@ -79,13 +82,18 @@ def _check_parameters(plant: Plant, where: object) -> None:
     for group, cls in plant.parameters.items():
         try:
             quantities: Mapping[str, Any] = list_quantities(cls)
-        except (IndexError, TypeError, AttributeError, NameError) as error:
+        except (TypeError, AttributeError, NameError) as error:
             raise InputError(where, f"parameters, {group}", "a NamedTuple whose fields are Annotated[float, "
                              f'Quantity("unit")] ({error})') from error
         for name, q in quantities.items():
             field = f"{group}.{name}"
-            require(isinstance(q, Quantity) and bool(q.unit), where, field, 'Quantity("unit"), "1" for none')
-            require(q.unit == "s" or field != "controller.period", where, field, f"a period in s, not in {q.unit}")
+            require(isinstance(q, Quantity) and bool(q.unit), where, field,
+                    'Annotated[float, Quantity("unit")], "1" for no unit')
+            for holds, expected in (
+                    (q.unit == "s" or field != "controller.period", f"a period in s, not in {q.unit}"),
+                    (q.low <= q.high and q.above < q.below, f"a low end below the high one, not a range {q.bounds}"),
+                    (0.0 <= q.tolerance <= 1.0, f"a tolerance from 0 to 1, a fraction, not {q.tolerance:g}")):
+                require(holds, where, field, expected)
             value = plant.values.get(field, cls._field_defaults.get(name))
             require(isinstance(value, float | int), where, field, f"a nominal value as default, not {value!r}")
             require(not q.refuses(float(value or 0.0)), where, field, f"{q.expected}, not {value:g}")
@@ -128,8 +136,7 @@ class Finding(NamedTuple):
 def find_divergence(model: Model, columns: Mapping[str, NDArray[np.float64]]) -> str:
     """Which signal is not a finite number first, and when; empty if all are finite."""
     for signal in model.kind.signals.columns:
-        bad = np.flatnonzero(~np.isfinite(columns[signal.name]))
-        if len(bad):
+        if len(bad := np.flatnonzero(~np.isfinite(columns[signal.name]))):
             return f"{signal.name} is no finite number from t = {bad[0] * model['controller.period']:g} s on"
     return ""
 
@@ -144,10 +151,9 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
     from plant.run import simulate
     from plant.selftest import check_effect
 
-    kind = model.kind
+    kind, period = model.kind, model["controller.period"]
     demanded, where = kind.signals.command, kind.file or kind.name
     place_faults(kind.faults, kind, where)
-    period = model["controller.period"]
     command = kind.build_nominal_command(period)
     require(np.abs(command).max() <= demanded.largest, where, "profile", f"demands of at most {demanded.largest:g} "
             f"{demanded.unit} either way, the largest of the signal {demanded.name}, not {np.abs(command).max():g}")
@@ -167,11 +173,14 @@ def check_behaviour(model: Model) -> Iterator[Finding]:
     is_same = all(np.array_equal(compiled_run[name], plain_run[name]) for name in compiled_run)
     yield Finding("compiled code", is_same, "the bits of plain Python" if is_same else "differs from plain Python")
     finer = run(2 * model.steps)
-    errors = {s.name: rms(finer[s.name] - once[s.name]) / max(np.ptp(once[s.name]), 1e-300)
-              for s in kind.signals.outputs if s.name not in silent}
-    if worst := max(errors, key=lambda name: errors[name], default=""):
-        yield Finding("step", errors[worst] < MOST_STEP_ERROR, f"half the step changes {worst} by "
-                      f"{100 * errors[worst]:.2g} % of its range (limit {100 * MOST_STEP_ERROR:g} %)")
+    changes = {s: np.abs(finer[s.name] - once[s.name]) for s in kind.signals.outputs if s.name not in silent}
+    limits = {s: min(MOST_STEP_ERROR * np.ptp(once[s.name]), MOST_STEP_NOISE * (model.values.get(s.noise) or np.inf))
+              for s in changes}
+    if worst := max(changes, key=lambda s: rms(changes[s]) / limits[s], default=None):
+        yield Finding("step", rms(changes[worst]) < limits[worst], f"half the step changes {worst.name} by "
+                      f"{rms(changes[worst]):.2g} {worst.unit} RMS, {changes[worst].max():.2g} at most (limit "
+                      f"{limits[worst]:.2g} RMS: {MOST_STEP_NOISE:g} of its noise or {100 * MOST_STEP_ERROR:g} % of "
+                      "its range, whichever is less)")
     wanted = 0.1 * np.ptp(once[kind.signals.controlled.name])
     push = np.repeat([np.abs(once[kind.signals.drive.name]).max(), 0.0], PUSHED_ROWS)
     idle, lanes = 0.0 * push, Lanes(quiet, ())

@@ -171,7 +171,8 @@ class Plant:
         Raises:
             InputError: a segment that is not whole cycles.
         """
-        return build_profile(self.profile, rate=1.0 / (period or self.nominal["controller.period"])).command
+        with explain_errors(str(self.file or self.name), "profile"):
+            return build_profile(self.profile, rate=1.0 / (period or self.nominal["controller.period"])).command
 
     def find_tolerance(self, name: str, q: Quantity) -> float:
         """Scatter of a parameter from unit to unit, as a fraction; 0 where the nominal value is zero."""
@@ -355,9 +356,7 @@ def find_loaded_plant(name: str, where: object) -> Plant | None:
 
 def find_key(name: str) -> str:
     """What this process calls a user's plant of another one, which may have loaded its file from another folder."""
-    if name in _LOADED:
-        return name
-    return next((key for key in _LOADED if Path(key).name == Path(name).name), name)
+    return next((key for key in (name, *_LOADED) if key in _LOADED and Path(key).name == Path(name).name), name)
 
 
 def is_loaded(path: Path, source: bytes) -> bool:

@@ -69,7 +69,7 @@ def list_quantities(group: type[Any]) -> Mapping[str, Quantity]:
     """The fields of a parameter group, in order, with their quantities."""
     if group not in _KNOWN_GROUPS:  # reading annotations takes longer than everything else about a model
         hints = get_type_hints(group, include_extras=True)
-        _KNOWN_GROUPS[group] = {name: get_args(hints[name])[1] for name in group._fields}
+        _KNOWN_GROUPS[group] = {name: (*get_args(hints[name]), None, None)[1] for name in group._fields}
     return _KNOWN_GROUPS[group]
 
 

@@ -137,7 +137,14 @@ def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> Non
 @pytest.mark.parametrize(("old", "new", "message"), [
     ('Quantity("ohm", "R", low=0.01, high=100, tolerance=0.05)', 'Quantity("")', "motor.resistance.*unit"),
     ("resistance: Annotated[float, Quantity(\"ohm\", \"R\", low=0.01, high=100, tolerance=0.05)] = 2.0",
-     "resistance: float = 2.0", "motor.*Annotated"),
+     "resistance: float = 2.0", "motor.resistance.*Annotated"),
+    ("low=0.01, high=100", "low=100, high=0.01", "motor.resistance: expected a low end below the high one, .*0.01"),
+    ("tolerance=0.05)] = 2.0", "tolerance=-0.05)] = 2.0", "motor.resistance: expected a tolerance from 0 to 1,.*-0.05"),
+    ("tolerance=0.05)] = 2.0", "tolerance=5.0)] = 2.0", "motor.resistance: expected a tolerance from 0 to 1, .*not 5"),
+    ("profile=(", "solver_step=-1e-5, profile=(", "solver_step: expected above 0 s .*, not -1e-05"),
+    ("profile=(", "solver_step=0.5, profile=(", "solver_step: expected .* at most controller.period, not 0.5"),
+    ("largest=100.0", "largest=-100.0", "signal demand, largest: expected a number above 0 rad, not -100"),
+    ("Step(to=0.5", 'Step(to=float("nan")', "profile: expected segments .* of finite numbers"),
     ("tolerance=0.05)] = 2.0", "tolerance=0.05)]", "motor.resistance.*nominal value"),
     ("tolerance=0.05)] = 2.0", "tolerance=0.05)] = 2000.0", "motor.resistance.*to 100 ohm"),
     ("tolerance=0.05)] = 2.0", 'tolerance=0.05)] = "2"', "motor.resistance.*nominal value"),
@@ -200,18 +207,23 @@ def test_the_signal_may_be_in_another_unit_than_the_state_that_moves(tmp_path: P
     assert kind.find_share_moved(kind.move) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("moves", "passes"), [
-    ('("angle", "motor")', False), ('("angle",)', False),
-    ("lambda s, d, p: State(s.current, s.speed, s.angle + d, s.motor + d * p.wheel.ratio)", True)])
-def test_fields_that_do_not_move_along_fail_the_check(moves: str, passes: bool, tmp_path: Path) -> None:
+RIGHT = "lambda s, d, p: State(s.current, s.speed, s.angle + d, s.motor + d * p.wheel.ratio)"
+
+
+@pytest.mark.parametrize(("moves", "check", "passes"), [
+    ('("angle", "motor")', "moves", False), ('("angle",)', "moves", False), (RIGHT, "moves", True),
+    (RIGHT, "step", False)])
+def test_a_plant_file_that_runs_and_is_wrong_fails_its_check(moves: str, check: str, passes: bool, tmp_path: Path
+                                                             ) -> None:
     """A motor's angle and the angle of the wheel behind a stiff shaft, at rest elsewhere than at 0: moved by the same
-    angle in spite of the gear, the wheel alone, or both as they have to be."""
+    angle in spite of the gear, the wheel alone, or both as they have to be. A rule for one angle and another for the
+    other let them drift apart: by less than 1 % of the range, but by more than the noise."""
     text = TEXT.replace("    angle: float = 0.0", "    angle: float = 0.2\n    motor: float = 10.0").replace(
         "- load)", "- load - 2e3 * (s.angle - s.motor / ratio))").replace(
         "(s.speed + speed))", "(s.speed + speed), s.motor + h * ratio * speed)").replace(
         '("angle",)', moves)
     model = load_model(write_file(tmp_path / "shaft.py", text))
-    finding = next(finding for finding in check_behaviour(model) if finding.check == "moves")
+    finding = next(finding for finding in check_behaviour(model) if finding.check == check)
     assert finding.passed == passes
 
 
