@@ -571,20 +571,22 @@ class Kind(NamedTuple):
 
 
 KINDS: dict[str, Kind] = {
-    "overshoot": Kind("How far a step goes beyond its target, % of the step.", "%",
+    "overshoot": Kind("How far a step goes beyond its target, % of the step; median over 5 ms.", "%",
                       lambda check, run, span: measure_overshoot(run.read_step(span))),
-    "settling_time": Kind("Time until a step stays within +-`band` of its target, s.", "s", lambda check, run, span:
-                          measure_settling_time(run.read_step(span), check.band), Settling, is_rounded=True),
-    "rise_time": Kind("Time from 10 % to 90 % of a step, s.", "s",
+    "settling_time": Kind("Time until a step stays within +-`band` of its target, s; median over 5 ms.", "s",
+                          lambda check, run, span: measure_settling_time(run.read_step(span), check.band), Settling,
+                          is_rounded=True),
+    "rise_time": Kind("Time from 10 % to 90 % of a step, s; median over 5 ms.", "s",
                       lambda check, run, span: measure_rise_time(run.read_step(span))),
     "steady_error": Kind("Size of the mean position error, m.", "m",
                          lambda check, run, span: abs(float(run.read_signal("error", span).mean()))),
     "ramp_error": Kind("Mean lag behind a ramp, m.", "m", lambda check, run, span: measure_ramp_error(
         run.read_signal("error", span), run.read_signal(run.signals.command.name, span))),
-    "break_away": Kind("Position error before the spool lets go on a slow ramp, m.", "m",
+    "break_away": Kind("Position error before the spool lets go on a slow ramp, m; median over 5 ms.", "m",
                        lambda check, run, span: measure_break_away(run.read_signal("error", span), run.rate)),
-    "max_error": Kind("Largest position error in either direction, m.", "m", lambda check, run, span: float(
-        np.abs(filter_median(run.read_signal("error", span), run.rate)).max())),
+    "max_error": Kind("Largest position error in either direction, m; median over 5 ms.", "m",
+                      lambda check, run, span: float(np.abs(filter_median(run.read_signal("error", span), run.rate)
+                                                            ).max())),
     "rms_error": Kind("Root mean square of the position error, m.", "m",
                       lambda check, run, span: float(np.sqrt(np.mean(run.read_signal("error", span) ** 2)))),
     "never_exceeds": Kind("Largest size of a signal, every sample counting.", "", lambda check, run, span: float(
