@@ -101,6 +101,7 @@ def _check_parameters(plant: Plant, where: object) -> None:
             "a group Controller with the field period, s, the cycle of the controller")
 
 
+@np.errstate(all="ignore")  # a division by zero shows in the run
 def _check_readings(plant: Plant, where: object) -> None:
     """One call of `measure` and of `step`, in plain Python, on the plant at rest."""
     from plant.model import build_bare_model, build_kernel

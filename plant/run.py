@@ -65,6 +65,7 @@ def draw_noise(seed: int, numbers: int = NOISES, block: int = 64) -> Iterator[li
         yield from generator.standard_normal((block, numbers)).tolist()
 
 
+@np.errstate(all="ignore")  # of a law in plain Python: who reads the run sees what is not finite
 def simulate(model: Model, command: Array, load: Array | None = None, seed: int = 0, steps: int | None = None,
              fast: bool = True, drawn: Array | None = None) -> Columns:
     """Run the model with its own controller over a command.
@@ -189,6 +190,7 @@ def find_compile_error(error: Exception) -> InputError | None:
     return InputError(f"{places[0][0]}:{places[0][1]}", "", f"Python that can be compiled ({message})")
 
 
+@np.errstate(all="ignore")
 def _find_law_error(model: Model) -> tuple[str, Exception] | None:
     """The same mistake as Python tells it, with file and line, if it makes it too: numba says neither."""
     files = {law.__code__.co_filename for law in (*model.kind.list_laws(model.effects), model.kind.step)

@@ -268,7 +268,8 @@ def _measure_sensitivities(tables: Mapping[str, Floats], healthy: Floats, com: F
     """Mean and scatter of healthy units, and what each fault at MidBand adds, by precursor."""
     fault_features = {word: compute_features(com, x, period, parts, unit, scale) for word, x in tables.items()}
     healthy_features = compute_features(com, healthy, period, parts, unit, scale)
-    return {name: {"healthy": _average_known(values), "noise": float(np.nanstd(values, ddof=1)),
+    return {name: {"healthy": _average_known(values),
+                   "noise": float(np.nanstd(values, ddof=1)) if np.isfinite(values).sum() > 1 else float("nan"),
                    **{word: _average_known(x[name]) - _average_known(values[:len(x[name])])
                       for word, x in fault_features.items()}} for name, values in healthy_features.items()}
 

@@ -125,6 +125,8 @@ def test_the_written_example_passes_its_checks(tmp_path: Path) -> None:
     result = rig("check", file, "--json")
     assert result.status == 0 and result.json["verdict"] == "SOUND" and len(result.json["checks"]) == 7
     assert rig("new", "plant", "new_plant", "--out", file).status == 2  # it replaces nothing
+    assert "new_plant.py: segment, time: expected whole cycles of 0.00105 s" in refuse(
+        "simulate", "--model", file, "--set", "controller.period=0.00105")
 
 
 def test_its_own_effect_may_have_the_name_of_a_shared_one(tmp_path: Path) -> None:
@@ -185,7 +187,9 @@ def test_a_wrong_plant_file_is_refused_in_one_line(old: str, new: str, message: 
 TIMES = "Hold(time=0.1), Step(to=0.5, time=0.9), Sine(amplitude=0.2, frequency=2.0, time=1.0)),"
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("old", "new"), [
+    pytest.param("    h, ratio,", "    late = min(1.0, 1.0 / u.t)\n    h, ratio,", id="division by zero"),
     pytest.param(TIMES, 'Step(to=0.5, time=0.1002),), values={"controller.period": 2e-4},', id="cycles of 0.2 ms"),
     pytest.param(TIMES, 'Step(to=0.5, time=0.3),), values={"controller.period": 3e-3},', id="333.3 cycles a second"),
     pytest.param("Controller),\n", """Controller, NamedTuple("Jack", static_friction=Annotated[float, Quantity("N")])),

@@ -30,8 +30,9 @@ def run_command(args: argparse.Namespace) -> int:
     require(kind.name.fullmatch(path.stem) and not iskeyword(path.stem), "NAME", path.stem,
             f"{'small ' if kind.name is WORD else ''}letters, digits and _, and no keyword of Python")
     require_new(require_writable(path, "--out"), is_forced=args.force)
-    check = kind.check.format(path=path) + (f" --model {args.model}" if args.model and args.kind != "bench" else "")
     plant = load_model(args.model or "eha").kind
+    more = f" --model {args.model}" if args.kind != "bench" else " --trust" if plant.file else ""
+    check = kind.check.format(path=path) + (more if args.model else "")
     text = kind.write(path, args, plant, check)
     write_text(path, text)
     try:

@@ -96,7 +96,7 @@ def test_a_bench_of_an_own_plant_is_guessed_from_its_signals(tmp_path: Path) -> 
     (tmp_path / "jack.py").write_text(PLANT.read_text().replace('"tc", "rad"', '"tc", "deg"'))
     result = rig("new", "bench", "trim", "--dbc", tmp_path / "trim.dbc", "--model", tmp_path / "jack.py",
                  "--out", tmp_path / "trim.toml")
-    assert result.status == 0 and "COMPLETE" in result.out
+    assert result.status == 0 and "COMPLETE" in result.out and "trim.toml --trust" in result.out
     bench = load_bench(str(tmp_path / "trim.toml"))
     counts = {each.name: each.count for spec in bench.frames.frames for each in spec.fields}
     assert {name: float(count) for name, count in counts.items()} == pytest.approx({

@@ -164,6 +164,7 @@ BAD = [  # text, then what the user reads
      "mine.toml:3: load[1]: expected at most 1e+06 N either way, not 2e+06"),
     (HEAD + 'load = [{ kind = "points", points = [[0, 1, 2]] }]\n',
      "mine.toml:3: load[0].points[0]: expected [a number, a number], not [0, 1, 2]"),
+    (HEAD + 'plant = "none.py"\n', "mine.toml:3: plant: expected one of eha, ehs, ema, or a Python file that exists"),
     (HEAD + 'faults = [{ kind = "parameter", parameter = "filter.cloging", value = 1, start = 0 }]\n',
      "mine.toml:3: faults[0].parameter: expected a field of filter"),
     (HEAD + 'faults = [{ kind = "parameter", parameter = "filter.clogging", value = 1.5, start = 0 }]\n',
