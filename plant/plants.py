@@ -343,8 +343,8 @@ def find_plant(name: str) -> Plant:
         InputError: there is none.
     """
     if name not in _LOADED:
-        require(name in MODULES, "plant", name, f"one of {', '.join(MODULES)}, or a Python file that exists and is that "
-                f"of --model or of the bench, not {name}")
+        require(name in MODULES, "plant", name, f"one of {', '.join(MODULES)}, or a Python file that exists and is "
+                f"that of --model or of the bench, not {name}")
         _LOADED[name] = find_declared_plant(importlib.import_module(MODULES[name]), name)
         CATALOGUE.of_plants.update(_LOADED[name].effects)
     return _LOADED[name]
