@@ -138,7 +138,8 @@ def _compare_at_lags(trace: Trace, model: Model, limit: float, com: int, xj: int
     unknown[len(unknown) + min(0, com, xj):] = True
     residual[unknown] = np.nan
     gain = sum(find_controller_gain(model, trace.period))
-    cor, xj_step, com_step = (measure_resolution(column) for column in (trace.drive, trace.controlled, trace.command))
+    cor, xj_step, com_step = (measure_resolution(trace.column(s.name), s.unit) for s in (
+        trace.declared.drive, trace.declared.controlled, trace.declared.command))
     single_precision = 1e-7  # of the drive's limit: a firmware may calculate in single precision
     rounding = float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0)
     largest = limit if math.isfinite(limit) else float(np.nanmax(np.abs(trace.drive)))

@@ -616,9 +616,10 @@ def measure_firmware_resolution(model: Model, trace: Trace) -> float:
 
     Where the file holds Com or Cor with fewer digits, these.
     """
-    gain = find_controller_gain(model, trace.period)[0]
-    steps = np.array([max(BUS_CURRENT, measure_resolution(trace.drive)), gain * BUS_POSITION * trace.scale,
-                      gain * max(BUS_POSITION * trace.scale, measure_resolution(trace.command))])
+    gain, signals = find_controller_gain(model, trace.period)[0], trace.declared
+    steps = np.array([
+        max(BUS_CURRENT, measure_resolution(trace.drive, signals.drive.unit)), gain * BUS_POSITION * trace.scale,
+        gain * max(BUS_POSITION * trace.scale, measure_resolution(trace.command, signals.command.unit))])
     return float(np.sqrt((steps**2).sum() / 12.0))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from fdi.thresholds import ROUNDED_SHARE
 from fdi.trace.sections import Floats
-from plant import Place, Quantity, build_dataclass
+from plant import Place, Quantity, build_dataclass, list_fitting_units, require_unit
 
 
 @dataclass(frozen=True)
@@ -204,15 +204,22 @@ def is_rounding_left(residual: Floats, step: float, resolution: float) -> bool:
                 and np.sqrt(np.mean(magnitudes[is_inside] ** 2)) > max(least, 3.0 * resolution))
 
 
-def measure_resolution(x: Floats) -> float:
-    """The RMS step between the values that a column can hold, from the digits they are written with.
+def measure_resolution(x: Floats, unit: str) -> float:
+    """The RMS step between the values that a column can hold, from the digits they are written with, in `unit`.
 
+    They may have been written in another unit of its quantity: 0.1968504 inch has seven digits, in m it has more.
     A few values show none, 0.0: a demand of 5 mm has one digit and may be exact.
     """
     values = np.unique(x[~np.isnan(x)])
     if len(values) < FEWEST_VALUES:
         return 0.0
     values = values[:: max(1, len(values) // 400)]  # a few hundred show as many digits as all
+    factors = [float(require_unit(name, unit, "", "").factor) for name in list_fitting_units(unit)]
+    return max(factor * _measure_digit(values / factor) for factor in factors)
+
+
+def _measure_digit(values: Floats) -> float:
+    """What the last digit of values (n,) is worth, RMS."""
     digits, places = 1, -30
     for value in values[values != 0.0].tolist():
         mantissa, _, exponent = f"{value:.11e}".partition("e")  # 12 digits: more is rounding of a float

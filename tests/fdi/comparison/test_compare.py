@@ -414,9 +414,10 @@ def test_damaged_dynamics_are_refused(text: str) -> None:
 def test_resolution_of_a_column() -> None:
     x = np.random.default_rng(0).standard_normal(1000)
     six = np.array([float(f"{value:.5e}") for value in 5.0 + np.clip(x, -4.0, 4.0)])
-    for column, resolution in ((np.round(x, 3), 1e-3), (np.round(x * 1e5) * 1e-8, 1e-8), (six, 1e-5)):
-        assert measure_resolution(column) == pytest.approx(resolution, rel=0.01)
-    assert measure_resolution(x) < 1e-10 and measure_resolution(np.tile([5e-3, -5e-3], 500)) == 0.0
+    for column, resolution in ((np.round(x, 3), 1e-3), (np.round(x * 1e5) * 1e-8, 1e-8), (six, 1e-5),
+                               (0.0254 * np.round(x, 7), 2.54e-9)):
+        assert measure_resolution(column, "m") == pytest.approx(resolution, rel=0.01)
+    assert measure_resolution(x, "m") < 1e-10 and measure_resolution(np.tile([5e-3, -5e-3], 500), "m") == 0.0
 
 
 FOLDER = SHARED / "practice"
