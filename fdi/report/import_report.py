@@ -63,6 +63,10 @@ def _list_notes(imported: Imported, measurement: Measurement) -> list[str]:
     return [*(f"no {s.symbol}: {s.quantity} is not judged by itself" for s in signals.outputs if s.name not in names),
             *([f"no {signals.load.symbol}: it is taken as 0; a load that did act is then a force that the model lacks"]
               if signals.load and signals.load.name not in names else []),
+            *(f"{signals.find(s.name).symbol} is not held for a row, and its samples are no whole part of a row apart: "
+              f"its rows may be off by up to {1e3 / s.rate:.3g} ms, and rig compare may find fault with a healthy unit"
+              for s in imported.signals if s.name in signals.required and s.rate * imported.trace.period > 1.05
+              and s.how.startswith(("last sample", "low-pass filtered, straight", "straight"))),
             *([f"not in the map, not imported: {list_first(unused_columns, MOST)}"] if unused_columns else [])]
 
 

@@ -405,20 +405,35 @@ def _find_times(measurement: Measurement, import_map: ImportMap, signal: SignalM
 
 
 def _measure_cycle(samples: Samples, cycle: float) -> float:
-    """The model's cycle, or the controlled signal's period if longer; by the recording's clock if that drifts."""
+    """The model's cycle, or the controlled signal's period if longer; by the recording's clock if that drifts.
+
+    Samples that are no whole part of the cycle show the clock where the signal is held: by the times of its new values.
+    """
     nominal = cycle if samples.period < 1.25 * cycle else round(samples.period, 6)
     rows = float(np.rint(np.diff(samples.t) / samples.period).sum())
     mean = float(samples.t[-1] - samples.t[0]) / rows
     ratio = max(1, round(nominal / mean)) if mean < nominal else 1
-    return nominal if abs(mean * ratio / nominal - 1.0) * rows / ratio < SLIP else round(mean * ratio, 9)
+    drift = abs(mean * ratio / nominal - 1.0)
+    if mean < nominal and drift > LARGEST_DRIFT:
+        new = samples.t[1:][np.diff(samples.x) != 0.0]
+        new = new[:: 1 + len(new) // 20_000]
+        own = max(nominal * (1.0 + CLOCKS), key=lambda period: abs(np.exp(2j * np.pi / period * new).sum()))
+        is_held = find_update(samples, nominal) is None and find_update(samples, own) is not None
+        return round(float(own), 9) if is_held else nominal
+    return nominal if drift * rows < SLIP else round(mean * ratio, 9)
 
 
 def _make_rows(import_map: ImportMap, samples: Mapping[str, Samples], period: float) -> Floats:
-    """Times of the rows: from the first sample that all required signals share to the last, on the controlled one's."""
+    """Times of the rows: from the first sample that all required signals share to the last, on the controlled one's.
+
+    Where that or the drive is held for a row, a row begins when its new value comes.
+    """
     series = [samples[name] for name in import_map.declared.required]
     first = max(-math.inf if import_map.trace.start is None else import_map.trace.start, *(s.t[0] for s in series))
     last = min(math.inf if import_map.trace.end is None else import_map.trace.end, *(s.t[-1] for s in series))
-    origin = _find_origin(samples[import_map.declared.controlled.name], samples[import_map.declared.drive.name], period)
+    names = import_map.declared.controlled.name, import_map.declared.drive.name
+    origin = next((update for name in names if (update := find_update(samples[name], period)) is not None),
+                  float(samples[names[0]].t[0]))
     start = origin + period * math.ceil((first - origin) / period - 0.5)
     count = math.floor((last - start) / period + 0.5) + 1
     require(count >= 2, import_map.path, "signals",
@@ -427,16 +442,6 @@ def _make_rows(import_map: ImportMap, samples: Mapping[str, Samples], period: fl
             f"at most {MOST_ROWS} rows of {period:g} s, not {count}; is the unit of the time right?")
     out: Floats = start + period * np.arange(count)
     return out
-
-
-def _find_origin(controlled: Samples, drive: Samples, period: float) -> float:
-    """The time of a row: the first sample of the controlled signal, or where one of both, held, brings a new value."""
-    for samples in (controlled, drive):
-        ratio = round(period / samples.period)
-        phase = find_hold(samples, ratio) if ratio > 1 else None
-        if phase is not None:
-            return float(samples.t[0] + phase * samples.period)
-    return float(controlled.t[0])
 
 
 def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, period: float, unit: str
@@ -462,9 +467,11 @@ def _describe_unit(s: SourceTerm, si: str) -> str:
     return f"{sign}{scale}{unit}{offset}"
 
 
-SLIP = 0.4  # of a row: two clocks that drift apart by less over the recording are the same
+SLIP = 0.4  # of a sample: two clocks that drift apart by less over the recording are the same
 FOLDED_SHARE = 0.05  # of a signal's standard deviation; more above the rows' Nyquist frequency is filtered out first
-HELD_SHARE = 0.95  # of the changes that lie in one phase: a signal that is held between them
+LARGEST_DRIFT = 0.01  # of a clock against another; samples that are further from a part of a row are no part of it
+CLOCKS = 1e-6 * np.arange(-200, 201)  # by which a quartz clock may be off
+HELD_SHARE = 0.75  # of the changes that one phase would miss by chance and does not: a signal that is held between them
 
 
 class Samples(NamedTuple):
@@ -479,14 +486,25 @@ class Samples(NamedTuple):
         return float(np.percentile(np.diff(self.t), 50, method="lower"))
 
 
-def find_hold(samples: Samples, ratio: int) -> int | None:
-    """Which of so many samples brings a new value, 0 for the first; None if more than one does."""
-    rows = np.rint((samples.t - samples.t[0]) / samples.period).astype(int)
-    new = rows[1:][np.diff(samples.x) != 0.0]
-    if len(new) < 10:
+def find_update(samples: Samples, period: float, known: float | None = None) -> float | None:
+    """A time at which a signal that is held for a `period`, s, brings a new value; None if it is not held.
+
+    The value is new somewhere between two samples, which need not be a whole part of the period apart. `known` is such
+    a time of another signal; it is taken where it explains the changes, however few.
+    """
+    is_new = (np.diff(samples.x) != 0.0) & (np.diff(samples.t) < period)
+    last = samples.t[1:][is_new]
+    phases, starts = np.sort(last % period), np.sort(last % period - np.diff(samples.t)[is_new])
+    trials = phases if known is None else np.append(phases, (known - 1e-9) % period)  # times are rounded
+    counts = (np.searchsorted(starts, trials) + np.searchsorted(starts + period, trials)
+              - np.searchsorted(phases, trials))
+    free = 1.0 - samples.period / period  # share of the changes that a phase misses by chance
+    least = max(1.0, (1.0 - (1.0 - HELD_SHARE) * free) * len(last))
+    if free < 0.05 or counts.max(initial=0) < least:
         return None
-    counts = np.bincount(new % ratio, minlength=ratio)
-    return int(counts.argmax()) if counts.max() > HELD_SHARE * len(new) else None
+    if known is not None and counts[-1] >= least:
+        return known
+    return float(trials[counts.argmax()]) if free * len(last) >= 10.0 else None
 
 
 def place_samples(samples: Samples, rows: Floats, period: float, method: str, low_pass: bool | None,
@@ -502,6 +520,11 @@ def place_samples(samples: Samples, rows: Floats, period: float, method: str, lo
         cycle_part: where in its cycle a value that is held comes: "answer" after the row's time, "demand" before it,
             "" at it.
     """
+    update = find_update(samples, period, float(rows[0])) if method in ("auto", "samples") else None
+    if update is not None:
+        offset = (update - rows[0]) % period
+        middle = offset + (0.5 if cycle_part == "answer" or not offset else -0.5) * period
+        return _place_nearest(samples, rows + middle, 0.5 * period), "one sample a row; the signal is held for a row"
     ratio = period / samples.period
     whole = round(ratio)
     is_whole = whole >= 1 and abs(ratio / whole - 1.0) * len(rows) < 0.5 * whole + 0.01 * len(rows)
@@ -510,7 +533,7 @@ def place_samples(samples: Samples, rows: Floats, period: float, method: str, lo
         if placement is not None:
             return placement
     if method in ("auto", "samples") and whole > 1 and is_whole:
-        return _pick(samples, rows, period, whole, low_pass, cycle_part)
+        return _pick(samples, rows, whole, low_pass, bool(cycle_part))
     if method == "samples":
         return _place_nearest(samples, rows, 0.5 * period), "nearest sample"
     spacing = f"{1e3 * samples.period:.4g} ms apart"
@@ -537,18 +560,11 @@ def _place_each(samples: Samples, rows: Floats, period: float) -> tuple[Floats, 
     return out, f"as recorded{where}"
 
 
-def _pick(samples: Samples, rows: Floats, period: float, ratio: int, low_pass: bool | None, cycle_part: str
-          ) -> tuple[Floats, str]:
-    """Every so many samples; those of a held signal where its new value is."""
-    phase = find_hold(samples, ratio)
+def _pick(samples: Samples, rows: Floats, ratio: int, low_pass: bool | None, is_input: bool) -> tuple[Floats, str]:
+    """Every so many samples."""
     how = f"every {_format_ordinal(ratio)} sample"
-    if phase is not None:
-        offset = (samples.t[0] + phase * samples.period - rows[0]) % period
-        offset = 0.0 if offset > period - 0.25 * samples.period else offset
-        shift = {"answer": offset, "demand": offset - period if offset else 0.0}.get(cycle_part, 0.0)
-        return _place_nearest(samples, rows + shift, 0.6 * samples.period), f"{how}; the signal is held for {ratio}"
     if low_pass is None:
-        low_pass = not cycle_part and _measure_folded_share(samples, ratio) > FOLDED_SHARE
+        low_pass = not is_input and _measure_folded_share(samples, ratio) > FOLDED_SHARE
     if low_pass:
         samples, how = _filter(samples, ratio), f"low-pass filtered, {how}"
     return _place_nearest(samples, rows, 0.6 * samples.period), how

@@ -103,11 +103,18 @@ def test_held_answers_of_the_controller_keep_their_cycle() -> None:
     assert np.array_equal(x[:-1], np.arange(1.0, 1000.0))
 
 
-def test_clock_that_is_not_the_models_keeps_its_samples(tmp_path: Path) -> None:
-    """1.0003 ms for 1 ms slips by three rows in 10 s: the trace takes the recording's own period."""
-    x = np.sin(np.arange(10_000) / 50.0)
-    trace = convert(tmp_path, '[time]\nsource = "t"\n', t=np.arange(len(x)) * 1.0003e-3, com=x, xj=x, cor=x).trace
-    assert trace.period == pytest.approx(1.0003e-3) and np.array_equal(trace.xj, x)
+@pytest.mark.parametrize(("spacing", "period"), [
+    (1.0003e-3, 1.0003e-3), (0.3e-3, 1e-3), (1e-3 / 3, 1e-3), (0.375e-3, 1e-3), (0.9e-3, 1e-3), (0.375e-3, 1.00005e-3)])
+def test_logger_of_another_clock_brings_each_cycle_once(spacing: float, period: float, tmp_path: Path) -> None:
+    """1.0003 ms for 1 ms slips by three rows in 10 s: the trace takes the recording's own period.
+
+    Where each value is held for a cycle, the logger's samples need not be a whole part of it apart.
+    """
+    t = np.round(0.05e-3 + np.arange(int(9.9 / spacing)) * spacing, 7)
+    x = 1e-6 * np.floor(t / period)
+    trace = convert(tmp_path, '[time]\nsource = "t"\n', t=t, com=x, xj=x, cor=x).trace
+    assert trace.period == pytest.approx(period, rel=1e-6)
+    assert all((np.diff(np.rint(1e6 * trace.column(name)[:9000])) == 1.0).all() for name in ("com", "xj", "cor"))
 
 
 def guess(tmp_path: Path, lines: list[str]) -> GuessedMap:
