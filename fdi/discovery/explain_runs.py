@@ -248,10 +248,12 @@ def assess_explanation(e: Explanation, seed: int) -> Answer:
         unit = e.marks.resolution
         drive = e.search.problem.trace.declared.drive.name
         baseline["error"][drive], baseline["floor"][drive] = e.marks.controller * unit, unit
-    best = e.ledger[-1].fit if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base.fit
+    best = e.ledger[-1] if e.verdict in ("EXPLAINED", "AMBIGUOUS", "PARTLY") else e.base
     model = e.search.problem.model
     noiseless = tuple(c.name for c in list_searched_effects(model.plant) if c.port in UNREPLAYED and c.fitted)
-    suspicious = tuple(list_suspicious(best, model.plant))
+    # A fit that leaves more than noise, or another controller alone, has bent tolerances: they say nothing of the unit.
+    is_telling = best.is_at_floor and (best.effects or best.is_far or not e.marks.is_firmware_different)
+    suspicious = tuple(list_suspicious(best.fit, model.plant)) if is_telling else ()
     return Answer(e, tuple(_list_candidates(e, seed)), baseline, e.hidden, noiseless, suspicious,
                   tuple(_list_ledger(e, firmware_prints)))
 

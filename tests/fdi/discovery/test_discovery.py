@@ -37,7 +37,7 @@ from fdi.discovery.explain import (
     leave_out_unneeded,
     shows_effect,
 )
-from fdi.discovery.explain_runs import Answer, Candidate, explain_runs
+from fdi.discovery.explain_runs import Answer, Candidate, assess_explanation, explain_runs
 from fdi.discovery.laws.find_law import (
     LawSearch,
     evaluate_columns,
@@ -649,3 +649,7 @@ def test_nothing_is_claimed_of_a_unit_that_no_model_explains(explained: tuple[Ru
     worse = replace(e.base, ratio=dict.fromkeys(e.base.ratio, 5.0))
     unexplained = replace(explain_answer, explanation=replace(e, verdict="UNEXPLAINED", base=worse, ledger=(worse,)))
     assert "more than noise is left" in catch_refusal(describe_unit, runs, unexplained)
+    far = replace(e.base.fit, x=e.base.fit.x + 9.0)  # a fit that left more than noise has bent these tolerances
+    for ratio, is_listed in ((5.0, False), (1.0, True)):
+        base = replace(e.base, fit=far, ratio=dict.fromkeys(e.base.ratio, ratio))
+        assert bool(assess_explanation(replace(unexplained.explanation, base=base), 0).suspicious) == is_listed
