@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -61,7 +62,7 @@ from fdi.thresholds import (
     UNDECIDED_SHARE,
 )
 from fdi.trace import Flags, Floats, Trace, find_comb, hold_last, is_rounding_left, measure_resolution, rms, shift_rows
-from plant import Model, Signal, compute_needed_drive, count_nouns
+from plant import InputError, Model, Signal, compute_needed_drive, count_nouns
 
 CUT_OFF = 0.2  # of half the rate of rows
 DECIMATION = 10
@@ -103,6 +104,7 @@ class ControllerBlock(NamedTuple):
     com_lag: int = 0  # cycles: drive k answers the command of cycle k - com_lag
     xj_lag: int = 0  # and the controlled signal of cycle k - xj_lag
     gain: float = math.nan  # drive for each unit of the controlled signal, as the answers show it
+    gains: Mapping[str, float] | None = None  # of the model's law, with which it would answer so
     limit: float = math.inf  # of the model's drive
 
     @property
@@ -121,13 +123,35 @@ def compare_controller(trace: Trace, model: Model) -> ControllerBlock:
         return answer
     com, xj, gain = find_lags(trace, limit)
     answer = answer._replace(gain=gain)
-    if (com, xj) == (0, 0):
-        return answer
+    with suppress(InputError):  # a law of the user's own may not take what fits
+        answer = answer._replace(gains=fit_gains(trace, model, answer))
     late_answer = _compare_at_lags(trace, model, limit, com, xj)
     return late_answer._replace(gain=gain) if late_answer.error < CONTROLLER_LAG_RATIO * answer.error else answer
 
 
-def _compare_at_lags(trace: Trace, model: Model, limit: float, com: int, xj: int) -> ControllerBlock:
+def fit_gains(trace: Trace, model: Model, answer: ControllerBlock) -> dict[str, float]:
+    """The gains that differ where the model's law with other gains answers as recorded, by name; {} where none does.
+
+    Raises:
+        InputError: gains that the model may not have.
+    """
+    names = [name for name in model.values if name.startswith("controller.") and name.endswith("_gain")]
+    fitted, small = model, 1e-6  # far from the drive's limit a gain acts linearly
+    for _ in range(10 if names else 0):
+        residual = _compute_residual(trace, fitted, 0, 0)
+        slopes = np.array([residual - _compute_residual(trace, fitted.replace({name: fitted[name] + small}), 0, 0)
+                           for name in names]) / small
+        rows = np.isfinite(residual + slopes.sum(axis=0)) & (np.abs(trace.drive) < 0.98 * answer.limit)
+        step = np.linalg.lstsq(slopes[:, rows].T, residual[rows], rcond=None)[0]
+        fitted = fitted.replace({name: max(0.0, fitted[name] + float(x)) for name, x in zip(names, step, strict=True)})
+    gains = {name: fitted[name] for name, slope in zip(names, slopes if names else (), strict=True)
+             if abs(fitted[name] - model[name]) * rms(slope[rows]) > CONTROLLER_ERROR_RATIO * answer.floor}
+    corrected_answer = _compare_at_lags(trace, model.replace(gains), answer.limit, 0, 0)
+    return gains if corrected_answer.ratio <= CONTROLLER_ERROR_RATIO else {}
+
+
+def _compute_residual(trace: Trace, model: Model, com: int, xj: int) -> Floats:
+    """The drive less the model's answer to command and controlled signal of so many cycles before; NaN: unknown."""
     sensed = shift_rows(trace.controlled, xj)
     residual = trace.drive - answer_readings(model, trace, shift_rows(trace.command, com), hold_last(sensed))
     unknown = np.isnan(sensed) | np.isnan(residual) | ~trace.usable
@@ -137,19 +161,22 @@ def _compare_at_lags(trace: Trace, model: Model, limit: float, com: int, xj: int
     unknown[:max(0, com, xj)] = True
     unknown[len(unknown) + min(0, com, xj):] = True
     residual[unknown] = np.nan
+    return residual
+
+
+def _compare_at_lags(trace: Trace, model: Model, limit: float, com: int, xj: int) -> ControllerBlock:
+    residual = _compute_residual(trace, model, com, xj)
     gain = sum(find_controller_gain(model, trace.period))
     cor, xj_step, com_step = (measure_resolution(trace.column(s.name), s.unit) for s in (
         trace.declared.drive, trace.declared.controlled, trace.declared.command))
-    single_precision = 1e-7  # of the drive's limit: a firmware may calculate in single precision
-    rounding = float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0)
     largest = limit if math.isfinite(limit) else float(np.nanmax(np.abs(trace.drive)))
-    floor = max(rounding, single_precision * largest)
+    floor = max(float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0),
+                1e-7 * largest)  # a firmware may calculate in single precision
     comb = find_comb(trace.controlled, FINEST_COMB)
     if comb and is_rounding_left(residual, gain * comb.step, floor):
         # the controller reads the signal finer than the recording holds it
         floor = math.hypot(floor, gain * comb.step / math.sqrt(12.0))
-    error = float(np.sqrt(np.nanmean(residual**2))) if not unknown.all() else math.nan
-    return ControllerBlock(error, floor, com, xj, limit=limit)
+    return ControllerBlock(rms(residual), floor, com, xj, limit=limit)
 
 
 def find_lags(trace: Trace, limit: float, most_rows: int = 60_000) -> tuple[int, int, float]:
@@ -164,17 +191,15 @@ def find_lags(trace: Trace, limit: float, most_rows: int = 60_000) -> tuple[int,
     rows = rows[::max(1, len(rows) // most_rows)]
     if not trace.drive[rows].any():  # always at its limit, or 0
         return 0, 0, math.nan
-    columns = [x[rows - lag] for x in (trace.command, sensed) for lag in LAGS]
-    whole = np.column_stack([*columns, trace.drive[rows]])
+    whole = np.column_stack([*(x[rows - lag] for x in (trace.command, sensed) for lag in LAGS), trace.drive[rows]])
     gram = np.einsum("ki,kj->ij", whole, whole)
-    n, target = len(LAGS), gram[-1, -1]
+    n = len(LAGS)
     best = (math.inf, 0, 0, math.nan)
     for a in range(n):
         for b in range(n):
             pick = [a, n + b]
-            left, right = gram[np.ix_(pick, pick)], gram[pick, -1]
-            gains = np.linalg.lstsq(left, right, rcond=None)[0]
-            misfit = float(target - gains @ right)
+            gains = np.linalg.lstsq(gram[np.ix_(pick, pick)], gram[pick, -1], rcond=None)[0]
+            misfit = float(gram[-1, -1] - gains @ gram[pick, -1])
             if misfit < best[0] * (1 - 1e-9) - 1e-30 * (abs(LAGS[a]) + abs(LAGS[b])):
                 best = (misfit, LAGS[a], LAGS[b], float(gains[0]))
     return best[1], best[2], best[3]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi.comparison.compare import Comparison, SignalError
+from fdi.comparison.compare import Comparison, ControllerBlock, SignalError
 from fdi.comparison.residuals import Depends, ResidualTests, map_deviation
 from fdi.estimation import find_controller_gain
 from fdi.report.drawing import (
@@ -221,7 +221,15 @@ def _describe_controller(c: Comparison) -> str:
     gain, gain_unit = find_controller_gain(c.model, c.trace.period)[0], f"{d.drive.unit}/{d.controlled.unit}"
     is_off = math.isfinite(a.gain) and abs(a.gain - gain) > 0.002 * gain
     return (f"{path}: error {factor * a.error:.3g} {error_unit} RMS, floor {factor * a.floor:.3g} {error_unit}"
-            + (f"; its gain is {a.gain:.4g} {gain_unit}, the model's {gain:.4g} {gain_unit}" if is_off else ""))
+            + (describe_gains(a) or (f"; its gain is {a.gain:.4g} {gain_unit}, the model's {gain:.4g} {gain_unit}"
+                                     if is_off else "")))
+
+
+def describe_gains(a: ControllerBlock) -> str:
+    """With which gains the model's controller would answer as recorded; "" where none were found."""
+    return "" if not a.gains else (
+        f"; with {' '.join(f'--set {name}={gain:.5g}' for name, gain in a.gains.items())} it is equal to the last "
+        "digit")
 
 
 def describe_findings(c: Comparison, most_places: int = 3, most_changes: int = 6) -> list[Line]:
@@ -330,7 +338,8 @@ def collect_data(c: Comparison) -> dict[str, Any]:
         "where": [p._asdict() for p in c.where],
         "condition": c.condition, "blocks": dict(c.blocks), "disagree": list(c.named), "parts": dict(c.parts),
         "controller": {"error": c.answer.error, "floor": c.answer.floor, "com_lag": c.answer.com_lag,
-                       "xj_lag": c.answer.xj_lag, "gain": c.answer.gain},
+                       "xj_lag": c.answer.xj_lag, "gain": c.answer.gain,
+                       "gains": dict(c.answer.gains or {})},
         "drift": {"speed": c.drift, "free_error": c.free_error}, "drive_error": c.drive_error,
         "tolerances": None if c.scatter is None else {
             "enough": c.scatter.enough, "error": c.scatter.error, "ratio": c.scatter.ratio, "moved": c.scatter.moved},

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi.comparison.compare import compare_controller
 from fdi.discovery.explain_runs import Answer, Candidate, Suspicious, list_shared_effects
 from fdi.discovery.laws.find_law import Law, LawCurve, LawSearch, Missing
 from fdi.discovery.laws.terms import describe_formula
@@ -18,7 +19,7 @@ from fdi.discovery.search import Hypothesis
 from fdi.discovery.sensitivity import NEEDED, RUNGS, TRIALS, Claim
 from fdi.discovery.update_model import ModelUpdate, Row
 from fdi.estimation import Value
-from fdi.report.compare_report import OTHER_ACTUATOR
+from fdi.report.compare_report import OTHER_ACTUATOR, describe_gains
 from fdi.report.drawing import (
     AFTER,
     AMBER,
@@ -183,8 +184,10 @@ def _describe_unexplained(a: Answer) -> str:
         return (f"The model explains the run {FAR_OFF} ({_describe_furthest(base)}), and no effect of the catalogue "
                 "does it with usual ones.")
     if base.is_at_floor and not a.explanation.effects:
+        e = a.explanation
         return ("The output of the controller differs from the model's, and no effect of the catalogue explains the "
-                "difference." if a.explanation.marks.is_firmware_different else
+                f"difference{describe_gains(compare_controller(e.search.problem.trace, e.search.problem.model))}."
+                if e.marks.is_firmware_different else
                 "The model fits this run, but not the held-out run; this run does not show what is missing.")
     worst, signals = _find_worst_signal(a), find_signals(a)
     best = next(iter(a.candidates), None)

@@ -228,6 +228,16 @@ def test_a_recorder_that_rounds_positions_is_no_error_of_the_controller(c: Trace
     assert compare_controller(rounded_trace, other).ratio > CONTROLLER_ERROR_RATIO
 
 
+def test_the_gains_of_another_firmware_are_found(c: Trace) -> None:
+    """Integral and derivative as well, which bend what a proportional gain alone would be."""
+    error = 0.1 * (c.com - c.xj)
+    cor = 4.2 * error + 2.0 * c.period * np.cumsum(error) + 1e-3 * np.diff(error, prepend=error[0]) / c.period
+    block = compare_controller(c.with_columns({"com": 0.1 * c.com, "xj": 0.1 * c.xj, "cor": cor}), MODEL)
+    assert block.ratio > CONTROLLER_ERROR_RATIO and block.gains == pytest.approx({
+        "controller.proportional_gain": 4.2, "controller.integral_gain": 2.0,
+        "controller.derivative_gain": 1e-3}, rel=1e-6)
+
+
 @pytest.fixture(scope="module")
 def m(c: Trace) -> Motion:
     return describe_motion(c, {"xj": c.xj, "p12": c.p12, "xs": c.xs})

@@ -113,8 +113,8 @@ def test_logger_of_another_clock_brings_each_cycle_once(spacing: float, period: 
     t = np.round(0.05e-3 + np.arange(int(9.9 / spacing)) * spacing, 7)
     x = 1e-6 * np.floor(t / period)
     trace = convert(tmp_path, '[time]\nsource = "t"\n', t=t, com=x, xj=x, cor=x).trace
-    assert trace.period == pytest.approx(period, rel=1e-6)
-    assert all((np.diff(np.rint(1e6 * trace.column(name)[:9000])) == 1.0).all() for name in ("com", "xj", "cor"))
+    assert trace.period == pytest.approx(period, rel=1e-6) and all((
+        np.diff(np.rint(1e6 * trace.column(name)[:9000])) == 1.0).all() for name in ("com", "xj", "cor"))
 
 
 def guess(tmp_path: Path, lines: list[str]) -> GuessedMap:
