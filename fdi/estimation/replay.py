@@ -87,11 +87,10 @@ def require_finite_replay(trace: Trace, model: Model) -> None:
     Raises:
         InputError: such a model.
     """
-    drive = trace.declared.drive.name
     for name, output in replay_current(trace, model, max(REPLAY_STEPS, model.steps)).items():
         bad = np.flatnonzero(~np.isfinite(output))
-        require(not len(bad), model.name, name, f"a plant that stays finite; with the measured {drive} it is no finite "
-                f"number from t = {trace.t[bad[:1]].sum():g} s on")
+        require(not len(bad), model.name, name, "a plant that stays finite; with the measured "
+                f"{trace.declared.drive.name} it is no finite number from t = {trace.t[bad[:1]].sum():g} s on")
 
 
 def measure_misfit(trace: Trace, model: Model) -> float:
@@ -385,8 +384,7 @@ def measure_drift(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> tupl
 
 def replay_command(trace: Trace, model: Model, steps: int = REPLAY_STEPS) -> Columns:
     """Residuals, measured less model, of the chosen signals and the drive in a run from the command alone, no noise."""
-    rest_time = 1.0  # s at the first demand, before a closed-loop replay begins
-    rest_rows = round(rest_time / trace.period)
+    rest_rows = round(1.0 / trace.period)  # a second at the first demand, before a closed-loop replay begins
     command, load = (np.pad(x, (rest_rows, 0), "edge") for x in (trace.command, trace.load))
     lanes = Lanes(silence_sensors(model), (), steps)
     out = lanes.closed_loop(np.empty((1, 0)), command, load)[0]
@@ -859,10 +857,12 @@ def find_repeat(first: Trace, trace: Trace, model: Model, number: int) -> Trace:
             if abs(way.period / first.period - 1.0) < SAME_PERIOD]
     require(ways, source, "t", f"rows as in the trace it repeats; they are {1e3 * trace.period:g} ms apart")
     repeat = ways[0]
-    delays = [late for late in (0, _find_first_move(first) - _find_first_move(repeat))
-              if has_same_command(first, repeat, late)]
-    require(delays, source, first.declared.command.name,
-            "the command of the trace it repeats; another command is no repeat")
+    late, command = _find_first_move(first) - _find_first_move(repeat), first.declared.command
+    delays = [each for each in (0, late) if has_same_command(first, repeat, each)]
+    off = np.abs(_align_repeat(repeat, late, len(first)).command - first.command)
+    require(delays, source, command.name, "the command of the trace it repeats; another command is no repeat: "
+            f"{np.mean(off > SAME_COMMAND_POSITION * first.scale):.0%} of the rows differ, by {off.max():.2g} "
+            f"{command.unit} at {first.t[off.argmax()]:g} s (or its rows were imported at other times)")
     aligned_repeat = _align_repeat(repeat, delays[0], len(first))
     require(any(np.nansum(np.abs(aligned_repeat.column(name) - first.column(name))) > 0.0 for name in outputs),
             source, "", "the same command run again; every sample of this one is that of the trace itself")
@@ -878,12 +878,11 @@ def has_same_command(one: Trace, other: Trace, late: int = 0, overlap: float = 0
 
     It is not if these are less than `overlap` of the one.
     """
-    a, b = one.command, other.command
-    first, last = max(0, late), min(len(a), len(b) + late)
-    if last - first < overlap * len(a):
+    first, last = max(0, late), min(len(one), len(other) + late)
+    if last - first < overlap * len(one):
         return False
-    is_same = np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION * one.scale
-    return bool(np.mean(is_same) >= same_share)
+    return bool(np.mean(np.abs(one.command[first:last] - other.command[first - late:last - late])
+                        <= SAME_COMMAND_POSITION * one.scale) >= same_share)
 
 
 def _align_repeat(trace: Trace, late: int, rows: int) -> Trace:

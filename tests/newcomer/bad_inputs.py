@@ -224,7 +224,7 @@ BAD_INPUTS = [
     bad("compare run.csv --repeat other.csv", "other.csv", "com"),
     bad("compare run.csv --repeat run.csv", "--repeat run.csv", "the same command run again"),
     bad("explain run.csv --repeat run.csv", "--repeat", "run.csv", "the same command run again"),
-    bad("explain run.csv --repeat other.csv", "another command is no repeat"),
+    bad("explain run.csv --repeat other.csv", "another command is no repeat", "% of the rows differ, by", " m at "),
     bad("explain run.csv --holdout run.csv", "--holdout", "run.csv", "a run that no fit has seen"),
     bad("explain run.csv --holdout absent.csv", "a trace that can be read"),
     bad("explain run.csv --signals xj,q", "--signals: q: expected some of xj,p12,xs"),
