@@ -77,8 +77,8 @@ def replay_lanes(lanes: Lanes, values: Floats, trace: Trace, anchor: float = ANC
 
 def replay_current(trace: Trace, model: Model, steps: int = REPLAY_STEPS, anchor: float = ANCHOR_RATE) -> Columns:
     """The outputs, (n,) each, of the plant driven by the measured current, without noise."""
-    out = replay_lanes(Lanes(silence_sensors(model), (), steps), np.empty((1, 0)), trace, anchor=anchor)
-    return {name: out[0, :, i] for i, name in enumerate(trace.output_names)}
+    out = replay_lanes(Lanes(silence_sensors(model), (), steps), np.empty((1, 0)), trace, anchor=anchor)[0]
+    return dict(zip(trace.output_names, out.T, strict=True))
 
 
 def require_finite_replay(trace: Trace, model: Model) -> None:
@@ -611,7 +611,7 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
     _check_signals(trace, model, outputs, source)
     if trace.declared.names != EHA.names:  # an EHA, which has followed its drive for hundreds of rows, begins with main
         trace = trace.join_lead()
-    rows = _take_rows(trace, outputs)
+    rows = _take_rows(trace, outputs).with_notes(*_list_offsets(trace, model, outputs))
     ratio = trace.period / model["controller.period"]
     rows_in_cycle, cycles_in_row = round(1 / ratio), round(ratio)
     ms = 1e3 * trace.period
@@ -659,10 +659,11 @@ def _check_signals(trace: Trace, model: Model, outputs: Sequence[str], source: o
     require(trace.period <= 50 * model["controller.period"], source, "t",
             f"times in s, one row a cycle; the rows are {trace.period:g} s apart")
     for signal in declared[1:]:
-        largest = float(np.nanmax(np.abs(trace.column(signal.name)))) if signal.name in trace.signals else 0.0
+        largest = float(np.nanmax(sizes := np.abs(trace.column(signal.name)), initial=0.0))
         if largest > LIMIT_TIMES.get(signal.role, math.inf) * model.values.get(signal.limit, math.inf):
-            raise InputError(source, signal.name, f"values in {signal.unit}; the largest, {largest:g}, is "
-                                                  f"{largest / model[signal.limit]:.0f} times {signal.limit}")
+            raise InputError(source, signal.name, f"values in {signal.unit}; the largest, {largest:g} at "
+                             f"t = {trace.t[np.nanargmax(sizes)]:g} s, is {largest / model[signal.limit]:.0f} times "
+                             f"{signal.limit}, which {np.sum(sizes > model[signal.limit])} of {len(sizes)} rows exceed")
         require(largest <= LARGEST_TIMES * signal.largest, source, signal.name, f"values in {signal.unit}, of which "
                 f"the plant declares {signal.largest:g} as the largest; here it is {largest:g}")
     moves = float(np.nanmax(trace.command) - np.nanmin(trace.command)) > STILL * trace.scale
@@ -685,6 +686,14 @@ def _check_signals(trace: Trace, model: Model, outputs: Sequence[str], source: o
                 f"{declared.command.name}")
 
 
+def _list_offsets(trace: Trace, model: Model, outputs: Sequence[str]) -> list[str]:
+    """Notes on positions beyond the end stops by more than noise: no fault leaves them."""
+    return [f"{signal.symbol} reaches {reached:.3g} {signal.unit} where {signal.limit} is {model[signal.limit]:g} "
+            f"{signal.unit}: does the map of rig import leave an offset in it, or is this another actuator?"
+            for signal in map(trace.declared.find, outputs) if signal.limit in model.values
+            and (reached := float(np.nanmax(np.abs(trace.column(signal.name))))) > 1.05 * model[signal.limit]]
+
+
 def _take_rows(trace: Trace, outputs: Sequence[str]) -> Trace:
     """The recording row by row, nothing filled yet; of the outputs only those chosen, and the controlled one."""
     grid = trace.t[0] + trace.period * np.arange(len(trace))
@@ -692,9 +701,8 @@ def _take_rows(trace: Trace, outputs: Sequence[str]) -> Trace:
     if jitter > 0.1 * trace.period:
         trace = trace.with_notes(
             f"times are up to {1e3 * jitter:.2g} ms off an even grid; each row is taken as one cycle")
-    nothing = np.full(len(trace), np.nan)
     # the controller's block and the anchor of a replay need the controlled signal, chosen or not
-    unused_columns = {name: nothing for name in trace.output_names[1:] if name not in outputs}
+    unused_columns = {name: np.full(len(trace), np.nan) for name in trace.output_names[1:] if name not in outputs}
     return trace.with_columns(unused_columns, filled=np.zeros(len(trace), bool), incomplete=_find_incomplete(trace),
                               outputs=tuple(outputs))
 

@@ -266,9 +266,9 @@ def _rate_column(signal: Signal, signals: Signals, column: str, columns: Columns
         guess.unit = UNITS[likely_units[0]]
     amplitude = size * float(guess.unit.factor)
     if usual_range and low <= amplitude <= high:
-        guess.note(0.5, "its range is plausible")
+        guess.note(0.5, "its amplitude is plausible")
     elif usual_range and unit is not None:
-        guess.note(-1.0, f"its range, {amplitude:.3g} {si}, is unusual")
+        guess.note(-1.0, f"its amplitude, {amplitude:.3g} {si}, is unusual")
     return guess
 
 

@@ -74,6 +74,8 @@ def made(period: float = 1e-3, **changes: np.ndarray) -> Trace:
 
 @pytest.mark.parametrize(("changes", "field", "words"), [
     ({"xj": 1e3 * record_healthy().xj}, "xj", "values in m; the largest, 5.* is 1.. times jack.travel"),
+    ({"xj": np.where(np.arange(13_500) == 4999, 9990.0, record_healthy().xj)}, "xj",
+     "the largest, 9990 at t = 4.999 s, is 249750 times jack.travel, which 1 of 13500 rows exceed"),
     ({"com": 1e3 * record_healthy().com}, "com", "values in m"),
     ({"cor": 1e3 * record_healthy().cor}, "cor", "values in A"),
     ({"p12": 1e-5 * record_healthy().p12}, "p12", "values in Pa"),
@@ -93,6 +95,11 @@ def test_what_cannot_be_is_refused_in_a_line(changes: dict[str, Any], field: str
     signals = changes.get("signals")
     line = catch_refusal(read_cycles, made(**{k: v for k, v in changes.items() if k != "signals"}), MODEL, signals)
     assert re.search(f"{field}: .*expected .*{words}", line), line
+
+
+def test_an_offset_beyond_the_end_stops_is_a_note() -> None:
+    assert re.search(r"XJ reaches 0.05.* m where jack.travel is 0.04 m: .*offset", " ".join(read_cycles(
+        made(com=record_healthy().com + 0.0508, xj=record_healthy().xj + 0.0508), MODEL)[0].notes))
 
 
 @pytest.mark.parametrize("prepare", [partial(read_cycles, model=MODEL), hold_inputs])
