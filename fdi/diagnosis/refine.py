@@ -53,6 +53,7 @@ from fdi.estimation import (
     find_flat_directions,
     find_undecided_rows,
     find_unpredictable_rows,
+    follow_profile,
     get_power,
     guess_anchor_noise,
     guess_covariance,
@@ -76,6 +77,7 @@ from fdi.estimation import (
 )
 from fdi.progress import Progress, Stage, ignore_progress
 from fdi.thresholds import (
+    CONVERGED_GAIN,
     FAULT_BLAMED_SHARE,
     FITTED_RUN_WORST,
     FRICTION_UNCERTAINTY,
@@ -730,10 +732,29 @@ def report_fit(last: Fit, problem: CountedProblem, whole: Trace | None = None) -
                             {s.parameter: estimate_parameter(last, s.parameter)
                              for s in list_suspects(problem.model, problem.faults)}, last, errors, floor,
                             sum(problem.counts))
+    if refinement.is_explained:
+        open_sizes = {fault.name: profile_size(problem.alone, last, fault) for fault in problem.faults
+                      if np.ptp(sizes[fault.name][1:]) > 0.99 * np.ptp(fault.range)}
+        refinement = replace(refinement, sizes={**sizes, **open_sizes}, simulations=sum(problem.counts))
     if whole is None or whole is problem.trace:
         return refinement
     judgement = judge_on_all(problem, [last], whole, FINE_STEPS)[0]
     return replace(refinement, errors=judgement.errors, everywhere=judgement.typical_ratio(refinement.floor))
+
+
+def profile_size(problem: CountedProblem, fit: Fit, fault: Fault) -> Estimate:
+    """The size of a fault by its profile: the healthiest of those that fit as well as the best, and the 95 % interval.
+
+    Beyond some size a fault may change no signal further, and the slope there says nothing of the other sizes.
+    """
+    k = [f.name for f in fit.free].index(fault.parameter)
+    fits = [each for end in scaled_bounds(fit.free) for each in follow_profile(
+        problem, fit, k, float(end[k]), (fault.interval_factor * INTERVAL_95_SD) ** 2)]
+    best = min(fits, key=lambda each: each.cost)
+    alike = [each.values[fault.parameter] for each in fits if each.cost < best.cost + CONVERGED_GAIN]
+    ends = [fit.free[k].value(x + way * _find_narrowest(fit.free[k], x, fault)) for x, way in (
+        (float(min(each.x[k] for each in fits)), -1.0), (float(max(each.x[k] for each in fits)), 1.0))]
+    return Estimate(min(alike, key=fault.measure_departure), *sorted(ends))
 
 
 def _find_narrowest(f: Free, x: float, fault: Fault) -> float:

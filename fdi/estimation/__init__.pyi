@@ -119,6 +119,7 @@ from .unidentifiable import (
     estimate_smooth_covariance as estimate_smooth_covariance,
     find_flat_directions as find_flat_directions,
     finish_fit as finish_fit,
+    follow_profile as follow_profile,
     get_power as get_power,
     guess_covariance as guess_covariance,
     linearise_across as linearise_across,

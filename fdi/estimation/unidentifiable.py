@@ -25,6 +25,7 @@ from fdi.estimation.fit import (
     compute_weights,
     cut_at_bounds,
     find_best_trial,
+    fit_unknowns,
     follow_population,
     form_normal_equations,
     invert_hessian,
@@ -431,6 +432,7 @@ DIRECTION_WIDTH_SD = 3.0  # of a difference, standard deviations
 SMOOTH_WIDTHS = (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0)  # of differences that are compared, standard deviations
 FIRST_WIDTH = 10.0  # of the covariance that a last fit begins with: narrow differences see jumps alone, and stay narrow
 SMOOTH_PASSES = 4  # in which the covariance settles
+PROFILE_CUT, PROFILE_SHORTEST = 0.25, 1e-3  # factor on a step that fails; the shortest one, of the range
 WIDEST_VARIANCE, NARROWEST_VARIANCE = 25.0, 1e-14  # variances of scaled unknowns, within which a direction is taken
 
 
@@ -617,6 +619,35 @@ def descend(problem: LogProblem, fit: Fit, schedule: Sequence[tuple[float, int]]
         flat = (shown_by or problem).find_flat(fit.free, fit.x)
         fit = descend_valley(scale_noise(problem, factor), start, rounds, flat, problem.stage)
     return fit
+
+
+def follow_profile(problem: Problem, fit: Fit, k: int, end: float, more: float) -> list[Fit]:
+    """The fits along unknown `k` from a fit to `end`, scaled, that cost at most `more` than it does, the others fitted.
+
+    A valley may bend, so a step goes on along the last one and is cut until the fit follows. What lies behind a ridge
+    at which every step fails is tried as well.
+    """
+    fits, share, f = [fit], 0.25 / PROFILE_CUT, fit.free[k]
+    shortest = PROFILE_SHORTEST * (f.high - f.low) / f.scale
+
+    def fit_at(place: float) -> Fit:
+        value, x, last = f.centre + f.scale * place, fits[-1].x, fits[-min(2, len(fits))].x
+        ahead = (place - x[k]) / (x[k] - last[k]) if x[k] != last[k] else 0.0
+        x = np.clip(x + (x - last) * ahead * (ahead <= 1.0 / PROFILE_CUT), *scaled_bounds(fit.free))
+        x[k] = place
+        return replace(fit_unknowns(problem, [*fit.free[:k], f._replace(low=value, high=value), *fit.free[k + 1:]], x,
+                                    4), free=fit.free)
+
+    while abs(rest := end - fits[-1].x[k]) > shortest:
+        shares = min(share / PROFILE_CUT, 1.0) * PROFILE_CUT ** np.arange(8.0)
+        trials = (fit_at(end - (1.0 - float(part)) * rest)
+                  for part in (*shares[shares * abs(rest) > shortest], 0.25, 0.5, 0.75, 1.0))
+        found = next((each for each in trials if each.cost <= fit.cost + more), None)
+        if found is None:
+            break
+        share = (found.x[k] - fits[-1].x[k]) / rest
+        fits.append(found)
+    return fits
 
 
 def search_widely(problem: L, shown_by: LogProblem, home: Fit, widths: Floats, stages: Sequence[tuple[float, int]],

@@ -32,6 +32,7 @@ from fdi.estimation import (
     find_repeat,
     find_undecided_rows,
     finish_fit,
+    follow_profile,
     hold_inputs,
     is_friction,
     is_long,
@@ -371,6 +372,24 @@ def test_only_the_tolerance_limits_a_size_that_no_signal_tells_from_it() -> None
     first_fit = linearise(problem, free, np.array([2.0, -2.0]))
     fit = finish_fit(problem, first_fit, 5)
     assert first_fit.spread("size") < 0.2 and fit.spread("size") > 0.6 and abs(fit.x).max() < 0.5
+
+
+class BentValley(RoughSum):
+    """A product of two unknowns, and what the first one adds beyond 2, as a valve does that opens there."""
+
+    def predict_unknowns(self, free: Sequence[Free], x: Floats) -> Floats:
+        shown = np.stack([x[:, 0] * x[:, 1] - 4.0, np.maximum(x[:, 0] - 2.0, 0.0)], axis=1)
+        return 30.0 * np.repeat(shown, 50, axis=1)[:, None]
+
+
+@pytest.mark.parametrize(("start", "end", "reached"), [(1.9, 0.5, 0.5), (1.9, 9.0, 2.0), (0.6, 9.0, 2.0)])
+def test_a_profile_follows_a_bent_valley_and_ends_where_the_data_exclude(start: float, end: float, reached: float
+                                                                         ) -> None:
+    """The slope at the start would be that of a straight valley, and knows nothing of what begins at 2."""
+    free = [Free("first", 0.0, 1.0, np.inf, 0.5, 9.0, 0.02), Free("second", 0.0, 1.0, np.inf, 0.1, 50.0, 0.02)]
+    problem = BentValley(load_model("ema"), record_healthy(), (white_noise(1.0),))
+    fits = follow_profile(problem, linearise(problem, free, np.array([start, 4.0 / start])), 0, end, 3.84)
+    assert fits[-1].x[0] == pytest.approx(reached, abs=0.02) and max(each.cost for each in fits) < 3.85
 
 
 FLOOR = {"xj": 2e-6, "p12": 2e4, "xs": 1e-6}
