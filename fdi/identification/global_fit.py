@@ -19,10 +19,12 @@ from fdi.estimation import (
     LogFrictionRatio,
     LogProblem,
     compute_misfit,
+    compute_values,
     descend,
     evolve_fit,
     fit_unknowns,
     follow_population,
+    follow_profile,
     scale_noise,
     scaled_bounds,
     search_widely,
@@ -185,6 +187,19 @@ def profile_unknowns(problem: LogProblem, fit: Fit) -> Fit:
 
     tasks = [(k, way) for k, f in enumerate(fit.free) if is_wide(f) for way in (-1.0, 1.0)]
     return min([fit, *map_together(follow, tasks, problem.workers)], key=lambda each: each.cost)
+
+
+def profile_ranges(problem: LogProblem, fit: Fit, more: float) -> dict[str, tuple[float, float]]:
+    """The ranges of the wide unknowns, SI by name, within which a fit costs at most `more` than at its best.
+
+    Slopes at one place say nothing of a valley that bends, such as that of parameters of which only products show.
+    """
+    coarse = replace(problem.alone, steps=SEARCH_STEPS)
+    start = fit_unknowns(coarse, fit.free, fit.x)
+    ends = [(k, float(end[k])) for k, f in enumerate(fit.free) if is_wide(f) for end in scaled_bounds(fit.free)]
+    values = np.array([compute_values(fit.free, each.x) for fits in map_in_threads(
+        lambda task: follow_profile(coarse.alone, start, *task, more), ends, problem.workers) for each in fits])
+    return {fit.free[k].name: (float(values[:, k].min()), float(values[:, k].max())) for k, _ in ends}
 
 
 def put_unknown(x: Floats, k: int, value: float) -> Floats:

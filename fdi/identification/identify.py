@@ -64,6 +64,7 @@ from fdi.identification.global_fit import (
     fit_from_afar,
     is_fitted,
     polish_fit,
+    profile_ranges,
     profile_unknowns,
     put_unknown,
     scale_values,
@@ -597,12 +598,17 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted_runs: Sequence[
     best = settle(problem, fit_from_afar(problem, free, seed, progress))
     if model.kind.correct is not None and best.worst_fitted > FITTED_RUN_WORST:
         progress("fitting the beginnings of motions", 0.6)
-        moving_runs = [leave_out_rest(t, model, memory=0.0) for t in runs[:len(fitted_runs)]]
-        parts, _ = cut_long_runs(moving_runs, sources, model, floor)
+        parts, _ = cut_long_runs([leave_out_rest(t, model, memory=0.0) for t in runs[:len(fitted_runs)]], sources,
+                                 model, floor)
         begin = fit_beginnings(make_problem(best.model, parts, floor, problem.workers), free, floor)
         best = min(best, settle(*begin), key=lambda each: each.worst_fitted)
     problem, fit, hidden_values, fitted_model, errors, residuals = best
     estimates, covariance = estimate_parameters(model, ranges, fit, hidden_values)
+    if model.kind.correct is None and not model.values.keys() >= BALANCED and any(
+            e.share > 0.25 * IDENTIFIABLE_SHARE for e in estimates if e.name not in hidden_values):
+        # a valley along which parameters make up for each other may bend, which slopes do not see
+        ends = profile_ranges(problem, fit, (IDENTIFIED_INTERVAL_FACTOR * INTERVAL_95_SD) ** 2)
+        estimates = tuple(take_profile(e, *ends[e.name]) if e.name in ends else e for e in estimates)
     verdict, reason = decide_verdict(estimates, errors)
     progress("which runs would show more", 0.95)
     unseen = [e.name for e in estimates if not e.is_identifiable]
@@ -839,6 +845,13 @@ def estimate_parameters(model: Model, ranges: Sequence[Range], fit: Fit,
     return tuple(estimates), correlation
 
 
+def take_profile(e: Estimate, low: float, high: float) -> Estimate:
+    """The estimate with the range of its profile, SI; an interval that slopes call narrow keeps what it holds."""
+    low, high = (min(low, e.low), max(high, e.high)) if e.is_identifiable else (low, high)
+    share = math.log(high / low) / math.log(e.most / e.least) if e.least > 0.0 else (high - low) / (e.most - e.least)
+    return e._replace(low=low, high=high, share=min(share, 1.0), is_identifiable=share <= IDENTIFIABLE_SHARE)
+
+
 def list_correlations(estimates: Sequence[Estimate], matrix: Floats, least: float = 0.9) -> tuple[Correlation, ...]:
     """The pairs of parameters, but for hidden ones, that go together by at least so much."""
     pairs = [Correlation(a.name, b.name, float(matrix[i, j])) for i, a in enumerate(estimates)
@@ -887,7 +900,7 @@ def decide_verdict(estimates: Sequence[Estimate], errors: Sequence[RunError]) ->
         return "UNEXPLAINED", f"the best parameters leave {residual}"
     unseen = [e.name for e in estimates if not e.is_identifiable]
     if len(unseen) == len(estimates):
-        return "CANNOT_TELL", "these runs show none of the free parameters"
+        return "CANNOT_TELL", "these runs show none of the free parameters by itself"
     if unseen:
         return "PARTLY", f"these runs do not show {len(unseen)} of {len(estimates)} free parameters"
     worst = max((e for e in errors if not e.is_held_out), key=lambda e: e.decided_ratio)
