@@ -166,8 +166,7 @@ def test_current_of_the_ecu_follows_the_error_up_to_its_limit(ecu: EcuHarness, t
                                                               current: float) -> None:
     """3.6 A/m; the derivative part is 0 in the first cycle with a current and while nothing changes."""
     ecu.cycle(target, position, enable=0)
-    answers = [read(ecu.cycle(target, position)) for _ in range(2)]
-    assert answers == [pytest.approx((OPERATIONAL, current))] * 2
+    assert [read(ecu.cycle(target, position)) for _ in range(2)] == [pytest.approx((OPERATIONAL, current))] * 2
 
 
 @pytest.mark.parametrize(("name", "kind"), list(product(("Demand", "Feedback"), ("checksum", "counter"))))

@@ -103,8 +103,7 @@ def test_the_whole_catalogue_at_its_off_values_changes_no_bit(steps: int) -> Non
 def test_compiled_equals_interpreted_alone_or_with_the_others(name: str) -> None:
     """Compiled with the whole catalogue and interpreted by itself: the same numbers."""
     fast = columns(Model().with_effects(LAWS).replace(largest(name)), SHORT, seed=3, steps=FEW)
-    slow = columns(Model().replace(largest(name)), SHORT, seed=3, steps=FEW, fast=False)
-    assert (fast == slow).all()
+    assert (fast == columns(Model().replace(largest(name)), SHORT, seed=3, steps=FEW, fast=False)).all()
 
 
 def test_all_at_once() -> None:
@@ -237,8 +236,7 @@ def test_a_bad_file_is_refused_in_one_line(file: Path, text: str, message: str) 
     ("return x + p.cogging.farce", "load", partial(simulate, command=COMMAND)),
     ("return x + open('f')", "position", Actuator), ("return [x, 'text']", "load", partial(simulate, command=COMMAND))])
 def test_a_law_that_cannot_run_is_refused(file: Path, body: str, port: str, use: Callable[[Model], object]) -> None:
-    start = COGGING.index("    return x +")
-    load_text(file, COGGING[:start].replace("load", port) + f"    {body}\n")
+    load_text(file, COGGING[:COGGING.index("    return x +")].replace("load", port) + f"    {body}\n")
     assert "cogging" in catch_refusal(use, Model().with_effects(["cogging"]))
     assert gc.isenabled()  # it is off while a law is compiled
 

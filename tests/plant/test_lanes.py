@@ -100,8 +100,7 @@ def test_replay_is_that_of_the_actuator() -> None:
 @pytest.fixture(scope="module")
 def catalogue() -> Lanes:
     """The whole catalogue, all parameters of all effects free."""
-    model = QUIET.with_effects(EFFECTS)
-    return Lanes(model, [name for e in EFFECTS for name in CATALOGUE[e].off], steps=10)
+    return Lanes(QUIET.with_effects(EFFECTS), [name for e in EFFECTS for name in CATALOGUE[e].off], steps=10)
 
 
 def with_effects(lanes: Lanes, changes: dict[str, float]) -> np.ndarray:
@@ -132,8 +131,7 @@ def test_runs_go_to_the_kernel_with_the_fewest_effects(catalogue: Lanes, monkeyp
     values = np.vstack([with_effects(catalogue, changes) for changes in at_work])
     outputs = catalogue.replay(values, CURRENT, FORCE)
     monkeypatch.setattr(lanes_module, "FEW", 99)
-    whole = Lanes(catalogue.model, catalogue.names, catalogue.steps)
-    assert (outputs == whole.replay(values, CURRENT, FORCE)).all()
+    assert (outputs == Lanes(catalogue.model, catalogue.names, catalogue.steps).replay(values, CURRENT, FORCE)).all()
 
 
 def test_runs_with_few_costly_effects_get_a_kernel_of_their_own_once_it_is_worth_while(

@@ -30,8 +30,7 @@ def build_other_command() -> np.ndarray:
 
 def simulate_trace(model: Model, command: np.ndarray, load: np.ndarray | None = None, **options: Any) -> Trace:
     """What a simulation would have recorded."""
-    run = simulate(model, command, load, **options)
-    return Trace.from_columns(run._asdict(), 1e-3, {}, model.kind.signals)
+    return Trace.from_columns(simulate(model, command, load, **options)._asdict(), 1e-3, {}, model.kind.signals)
 
 
 def write_measured_runs(folder: Path, changes: Mapping[str, float]) -> dict[str, Path]:

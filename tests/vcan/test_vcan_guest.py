@@ -48,8 +48,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([sys.executable, FOLDER / "inside.py", folder, "compile"], check=True)
     parts = ["three", "ecu"]
     parts = parts if kernel_has_vcan0() else ["bus", *parts]  # with a vcan0 here the bus tests ran here
-    done = in_guest(sys.executable, FOLDER / "inside.py", folder, *parts)
-    (folder / "output.txt").write_text(done.stdout)
+    (folder / "output.txt").write_text(in_guest(sys.executable, FOLDER / "inside.py", folder, *parts).stdout)
     return folder
 
 
@@ -82,8 +81,7 @@ def test_a_run_by_three_processes_passes(out: Path, frames: list[tuple[int, byte
     failures = [check["name"] for check in answer["checks"] if not check["passed"]]
     assert (answer["verdict"], facts["status"]) == ("PASS", 0), f"{answer['why']}; failed: {failures}; {facts}\n{logs}"
     assert all(status in (0, 130) for status in facts["after_interrupt"].values()), logs
-    counts = Counter(cob_id for cob_id, _ in frames)
-    assert counts[0x080] >= answer["timing"]["cycles"] == 450
+    assert Counter(cob_id for cob_id, _ in frames)[0x080] >= answer["timing"]["cycles"] == 450
 
 
 def test_a_run_of_an_example_passes(out: Path) -> None:

@@ -228,8 +228,7 @@ maintenance = 0.04
     Path("unit").mkdir()
     run = "unit/2026-03-01.csv"
     rig("simulate", *options[:3], "--set", "dry_friction.torque=1.2", "--seed", "3", "--out", run)
-    bands = rig("fdi", "--learn-bands", *options, "--out", "bands.toml", "--json").json
-    assert bands["judges"] == ["bearing"]
+    assert rig("fdi", "--learn-bands", *options, "--out", "bands.toml", "--json").json["judges"] == ["bearing"]
     diagnosis = rig("fdi", run, *options, "--bands", "bands.toml", "--out", "page.html", "--json").json
     assert (diagnosis["ruling"], diagnosis["bands"]["ruling"]) == ("bearing", "bearing")
     assert diagnosis["events"] and {event["section"] for event in diagnosis["events"]} == {"step to 0.5 rad"}

@@ -88,8 +88,7 @@ SEEDS = range(20)
 
 
 def coloured(seed: int, n: int = 13_500) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    return lfilter([1.2e-6], [1.0, -0.8], rng.standard_normal(n))
+    return lfilter([1.2e-6], [1.0, -0.8], np.random.default_rng(seed).standard_normal(n))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -226,8 +225,7 @@ def search() -> Search:
 
 def test_a_held_out_run_may_lack_signals(search: Search) -> None:
     """Each that it has keeps its own noise."""
-    unseen = hold_inputs(record_plant(BIAS, COMMAND), ["xs"])
-    assert search.make_problem(unseen, 20).noise == search.problem.noise[-1:]
+    assert search.make_problem(hold_inputs(record_plant(BIAS, COMMAND), ["xs"]), 20).noise == search.problem.noise[-1:]
 
 
 def test_an_effect_counts_only_if_its_interval_leaves_out_the_off_value(search: Search) -> None:

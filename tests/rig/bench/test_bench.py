@@ -40,8 +40,7 @@ def test_without_gcc_it_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     monkeypatch.setattr(benchmarks.shutil, "which", lambda name: None)
     for name, value in (("bus_run_speed", 10.0), ("run_process_speed", 6.0), ("help_time", 0.1)):
         monkeypatch.setattr(benchmarks, f"measure_{name}", lambda value=value: value)
-    words = " ".join(rig("bench").out.split())
-    assert "C skipped: gcc is not installed; to get it: apt-get install gcc" in words
+    assert "C skipped: gcc is not installed; to get it: apt-get install gcc" in " ".join(rig("bench").out.split())
     report = answer("bench", "--out", tmp_path / "b.json")
     assert report == json.loads((tmp_path / "b.json").read_text()) and report["times_real_time"] > 0 < report["cycle"]
     assert (report["run_process"], report["help_process"]) == (6.0, 0.1)

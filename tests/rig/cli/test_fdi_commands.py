@@ -359,5 +359,4 @@ def test_a_gap_is_told(folder: Path, tmp_path: Path) -> None:
 
 def test_a_unit_without_leakage_is_judged(folder: Path) -> None:
     """A parameter that is zero in the model has no logarithm."""
-    tight = rig("fdi", folder / "short.csv", "--set", "jack.leakage=0", "--json").json
-    assert tight["refined"]["kintas"]["low"] == 0.0
+    assert rig("fdi", folder / "short.csv", "--set", "jack.leakage=0", "--json").json["refined"]["kintas"]["low"] == 0.0

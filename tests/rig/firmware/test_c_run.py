@@ -237,8 +237,7 @@ def test_same_answers_to_a_random_script(seed: int) -> None:
                      None)
     assert different is None, (python_frames[different], c_frames[different])
     assert len(c_frames) == len(python_frames)
-    kinds = {cob_id for _, cob_id, _ in c_frames}
-    assert kinds >= {0x082, 0x182, 0x582, 0x702}
+    assert {cob_id for _, cob_id, _ in c_frames} >= {0x082, 0x182, 0x582, 0x702}
     currents = {data[:4] for _, cob_id, data in c_frames if cob_id == 0x182}
     aborts = {data[4:] for _, cob_id, data in c_frames if cob_id == 0x582 and data[0] == 0x80}
     assert len(currents) > 500 and len(aborts) >= 9

@@ -137,8 +137,7 @@ class Instance:
 
     def get(self, name: str) -> float:
         """A real variable."""
-        values = (self.fmu.getReal if self.is_old else self.fmu.getFloat64)([self.places[name]])
-        return float(values[0])
+        return float((self.fmu.getReal if self.is_old else self.fmu.getFloat64)([self.places[name]])[0])
 
     def run(self, first: int, cycles: int) -> list[float]:
         """XJ of some cycles under a current that changes."""
@@ -378,8 +377,7 @@ def test_a_unit_of_another_tool_is_mapped_simulated_and_compared(folder: Path, v
 
 def test_identify_finds_the_parameters_that_the_map_gives_a_range_also_where_trials_diverge(folder: Path) -> None:
     build_fmu(Path("slide.fmu"), does="DIVERGE")
-    start = Path("command.csv").read_text().splitlines()[:60]
-    Path("command.csv").write_text("\n".join(start))
+    Path("command.csv").write_text("\n".join(Path("command.csv").read_text().splitlines()[:60]))
     answer("simulate", "--model", "slide.toml", "--command", "command.csv", "--set", "drive.gain=2.4", "--out",
            "run.csv")
     identification = answer("identify", "run.csv", "--model", "slide.toml", "--out", "found.toml")

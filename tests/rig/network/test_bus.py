@@ -313,8 +313,7 @@ def frame(cob_id: int, data: bytes = b"\1\2\3") -> can.Message:
 
 def test_it_is_registered_where_python_can_looks() -> None:
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
-    entry_point = EntryPoint("eha_rig_udp", groups["can.interface"]["eha_rig_udp"], "can.interface")
-    assert entry_point.load() is UdpBus
+    assert EntryPoint("eha_rig_udp", groups["can.interface"]["eha_rig_udp"], "can.interface").load() is UdpBus
     with can.Bus(interface="eha_rig_udp", channel=find_group(), bitrate=1_000_000) as bus:
         assert type(bus) is UdpBus
 
@@ -534,8 +533,7 @@ class TestDatagrams:
         except ValueError:  # its flags or its length contradict each other
             reference = (-1,)
         assert read_compiled(data) == reference
-        sorted_fields = dict(sorted(msgpack.unpackb(data).items()))
-        assert read_compiled(msgpack.packb(sorted_fields)) == (-1,)
+        assert read_compiled(msgpack.packb(dict(sorted(msgpack.unpackb(data).items())))) == (-1,)
 
     @given(st.integers(0, IDENTIFIER), st.binary(max_size=64), st.sets(st.sampled_from(range(3))))
     def test_packs_as_python_can_does(self, number: int, data: bytes, kinds: set[int]) -> None:

@@ -159,8 +159,7 @@ def client(*script: str | None) -> tuple[CheckedSdoClient, Server]:
         return servers[0]
 
     master = Master(EmbeddedWire(VirtualClock(), [make]), lambda: 0, False, load_bench())
-    sdo = master.network.nodes[PLANT].sdo
-    return sdo, servers[0]
+    return master.network.nodes[PLANT].sdo, servers[0]
 
 
 def test_a_transfer_that_the_server_has_lost_is_repeated() -> None:

@@ -434,8 +434,7 @@ def test_garbage_is_refused_and_the_plant_stays_as_it_was(what: str) -> None:
 
 
 def test_no_new_plant_while_one_runs() -> None:
-    harness = PlantHarness(scenario())
-    assert harness.download(scenario().to_bytes()) == Abort.STATE
+    assert PlantHarness(scenario()).download(scenario().to_bytes()) == Abort.STATE
 
 
 ACTIVE, RESET = CIA408.ladder[-1], CIA408.reset

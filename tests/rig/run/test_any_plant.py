@@ -100,8 +100,7 @@ def test_from_a_plant_file_to_its_hidden_fault(where: str, here: Path, monkeypat
 def test_a_plant_without_a_device_runs_with_its_own_controller(here: Path) -> None:
     """Nothing but the plant file: run, and repeat."""
     assert rig("new", "plant", "motor").status == 0
-    slower = Path("motor.py").read_text().replace('high=0.1)] = 1e-3', 'high=0.1)] = 2e-3')
-    Path("motor.py").write_text(slower)
+    Path("motor.py").write_text(Path("motor.py").read_text().replace('high=0.1)] = 1e-3', 'high=0.1)] = 2e-3'))
     result = rig("run", "--model", "motor.py", "--set", "dry_friction.torque=0.3", "--json", "--out", "run")
     assert (result.status, result.json["verdict"]) == (0, "PASS"), result
     assert Trace.read("run").period == 2e-3

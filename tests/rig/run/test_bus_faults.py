@@ -75,8 +75,7 @@ def test_what_a_node_must_report(tmp_path: Path, fault: str, node: str, code: st
 
 def test_a_short_valve_state_is_missing_in_the_log(tmp_path: Path) -> None:
     outcome = play_fault(tmp_path, 'kind = "short", frame = "valve_state", length = 6, start = 0.1, count = 2')
-    trace = Trace.read(tmp_path)
-    assert outcome.verdict == "PASS" and np.flatnonzero(np.isnan(trace.xs)).tolist() == [100, 101]
+    assert outcome.verdict == "PASS" and np.flatnonzero(np.isnan(Trace.read(tmp_path).xs)).tolist() == [100, 101]
 
 
 def test_corrupted_feedback_reaches_controller_and_log(sound: Path, tmp_path: Path) -> None:

@@ -87,8 +87,7 @@ def test_memory_is_locked_and_unlocked() -> None:
 
 
 def read_locked_kilobytes() -> int:
-    status = Path("/proc/self/status").read_text()
-    return int(status.partition("VmLck:")[2].split()[0])
+    return int(Path("/proc/self/status").read_text().partition("VmLck:")[2].split()[0])
 
 
 @pytest.mark.parametrize("collecting", [True, False])

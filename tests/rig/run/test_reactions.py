@@ -52,8 +52,7 @@ def test_a_node_that_was_reset_is_watched_as_before(tmp_path: Path) -> None:
     start = next(k for k in range(boot, len(frames)) if frames[k] == (0x000, b"\x01\x02"))
     writes = {data[1:4]: data for cob_id, data in frames[boot:start] if cob_id == 0x602 and data[0] >> 5 == 1}
     first_writes = {data[1:4]: data for cob_id, data in frames[:boot] if cob_id == 0x602 and data[0] >> 5 == 1}
-    indexes = {int.from_bytes(key[:2], "little") for key in writes}
-    assert indexes == {0x1006, 0x1016, 0x1017, GAINS}
+    assert {int.from_bytes(key[:2], "little") for key in writes} == {0x1006, 0x1016, 0x1017, GAINS}
     assert all(first_writes[key] == data for key, data in writes.items() if key[:2] != b"\x17\x10")
     assert writes[b"\x17\x10\0"][4:6] == (100).to_bytes(2, "little")
     assert outcome.verdict == "PASS"

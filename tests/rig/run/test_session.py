@@ -116,8 +116,7 @@ def test_a_sequence_may_be_about_trouble(tmp_path: Path) -> None:
     words = control_words(tmp_path)
     zero = words.index(0)
     assert set(words[zero:400]) == {0} and words[400] == 8 and set(words[401:]) == {7}  # reset, then current again
-    trace = Trace.read(tmp_path)
-    assert np.all(trace.cor[zero - 50 + 1:] == 0)
+    assert np.all(Trace.read(tmp_path).cor[zero - 50 + 1:] == 0)
 
 
 def test_a_meant_end_that_does_not_come_is_a_failure(tmp_path: Path) -> None:
@@ -165,16 +164,14 @@ def play_with_intruder(folder: Path, frames: list[tuple[int, bytes]]) -> Session
     ([(0x082, bytes.fromhex("3023010000000000"))], "node 2 controller 0x2330 (EMCY)"),
 ])
 def test_strangers_and_nodes_that_restart_end_main(tmp_path: Path, frames: list[tuple[int, bytes]], why: str) -> None:
-    session = play_with_intruder(tmp_path, frames)
-    assert session.safety.aborted.startswith(why) and phases(tmp_path)[2] == 50
+    assert play_with_intruder(tmp_path, frames).safety.aborted.startswith(why) and phases(tmp_path)[2] == 50
 
 
 def test_noise_of_strangers_is_nothing(tmp_path: Path) -> None:
     """Foreign nodes, short frames, unknown identifiers: logged as frames, else ignored."""
     noise = [(cob_id, bytes(length)) for cob_id in (0x084, 0x184, 0x284, 0x584, 0x604, 0x704, 0x7E5, 0x082, 0x083,
                                                     0x583, 0x603) for length in (0, 3)]
-    session = play_with_intruder(tmp_path, noise)
-    assert session.safety.aborted == "" and phases(tmp_path) == [50, 350, 50]
+    assert play_with_intruder(tmp_path, noise).safety.aborted == "" and phases(tmp_path) == [50, 350, 50]
 
 
 @pytest.mark.parametrize("error", [RigError("the bus is gone"), RuntimeError("a bug"), KeyboardInterrupt()])

@@ -57,8 +57,7 @@ ON_TIME = Timing(0, False, 1e-5, 2e-4, 2e-4, 1e-4, 1e-4, 0.0)
 def make_timing(cycle: int, **changes: float) -> Timing:
     """The timing of a cycle in which the bench was on time but for the changes."""
     names = ("lateness", "response", "work", "feedback_response", "valve_response", "execution")
-    values = {name: getattr(ON_TIME, name) for name in names} | changes
-    return Timing(cycle, False, **values)
+    return Timing(cycle, False, **({name: getattr(ON_TIME, name) for name in names} | changes))
 
 
 def watch(timings: Iterable[Timing], injected: Collection[int] = (), **policy: Any) -> str:

@@ -85,8 +85,7 @@ def run_with(folder: Path, old: str, new: str, *, in_code: bool = True) -> Comma
     source = CODE if in_code else SEQUENCE
     assert old in source
     text = source.replace(old, new)
-    file = write(folder, code=text) if in_code else write(folder, text)
-    return rig("run", file, "--out", folder / "out")
+    return rig("run", (write(folder, code=text) if in_code else write(folder, text)), "--out", folder / "out")
 
 
 @pytest.mark.parametrize(("old", "new", "line"), [

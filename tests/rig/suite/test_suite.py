@@ -76,8 +76,7 @@ timeout = 1.0
 
 
 def write_sequences(folder: Path) -> None:
-    requirement = 'requirement = "R-1", high = 30.0'
-    (folder / "short.toml").write_text(SHORT.replace("high = 30.0", requirement))
+    (folder / "short.toml").write_text(SHORT.replace("high = 30.0", 'requirement = "R-1", high = 30.0'))
     (folder / "own.py").write_text(CODE)
     for name in ("crash", "hang", "fail"):
         (folder / f"{name}.toml").write_text(SHORT.replace("checks = [", f"checks = [\n  {OWN_CHECK.format(name)}"))
