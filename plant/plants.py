@@ -357,7 +357,9 @@ def find_loaded_plant(name: str, where: object) -> Plant | None:
 
 def find_key(name: str) -> str:
     """What this process calls a user's plant of another one, which may have loaded its file from another folder."""
-    return next((key for key in (name, *_LOADED) if key in _LOADED and Path(key).name == Path(name).name), name)
+    if name in _LOADED:
+        return name
+    return next((key for key in _LOADED if Path(key).name == Path(name).name), name)
 
 
 def is_loaded(path: Path, source: bytes) -> bool:

@@ -135,8 +135,7 @@ def open_console() -> Console:
             self.quiet = True
             discard_output()
 
-    return Pipe(highlight=False, _environ={key: value for key, value in os.environ.items()
-                                           if (key, value) != ("COLUMNS", "0")})  # 0: not known, as in POSIX
+    return Pipe(highlight=False)
 
 
 def discard_output() -> None:

@@ -85,6 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a character that its encoding lacks must not end a run
+    if os.environ.get("COLUMNS") == "0":  # not known, as in POSIX; rich would print nothing
+        del os.environ["COLUMNS"]
     gc.set_threshold(50_000)  # 0.05 s less: most objects are made while modules load, and stay
     leave_out_reader(sys.argv[1:])
     keep_memory()
@@ -143,9 +145,10 @@ def run_command_line(words: Sequence[str]) -> int:
         build_parser().parse_args(words[:1])  # help, version, or an error: it ends here
     name = words[0]
     args = build_command_parser(name).parse_intermixed_args(words[1:])  # files may stand behind options
+    if any("\ud800" <= letter <= "\udfff" for letter in "".join(words)):  # such a name fits no log and no page
+        return _report_error(name, "expected names of files in UTF-8", 2)
     status = 0
     try:
-        "".join(words).encode()  # a name that is not UTF-8 can stand in no log and on no page
         status = find_work(name)(args)
         print(end="", flush=True)  # here, so that a closed pipe is reported below; there may be no standard output
         return status
@@ -156,8 +159,6 @@ def run_command_line(words: Sequence[str]) -> int:
     except BrokenPipeError:  # whoever read our output has stopped reading: nothing to report, nobody to report it to
         discard_output()
         return status
-    except UnicodeEncodeError:
-        return _report_error(name, "expected names of files in UTF-8", 2)
     except Exception as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             discard_output()
