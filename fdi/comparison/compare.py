@@ -416,7 +416,7 @@ def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place],
     if any(s.floor.lower_bound for s in table.values()):
         doubt = "without a repeat the floor is only a lower bound, and the error is not far above it"
     elif not is_open_alike:
-        doubt = "the error is not far above what a drive leaves open of which rows were not recorded"
+        doubt = "rows of the current were not recorded, and the error is not far above what they leave open"
     elif edgy > UNDECIDED_SHARE:
         doubt = f"{100 * edgy:.0f} % of the trace {_describe_cause(replay)}"
     is_sure = any(s.ratio > LOWER_BOUND_ERROR_RATIO or (is_open_alike and edgy <= UNDECIDED_SHARE

@@ -177,6 +177,7 @@ def read_rows(history: History, on_time: Mask) -> Rows:
 
 
 LIMIT = 5.0  # s: a controller that is not ready by then ends the run
+TIME_TO_SAY = 1.0  # s, until a controller has said whether the values of set-up make it ready
 
 
 class Enabling:
@@ -208,37 +209,41 @@ class Enabling:
 
         for _ in range(2):  # the second shows whether the first was answered: a status word from before says nothing
             self._play(step())
-        if self._play_until(lambda: self._find_state() == State.ACTIVE, step):
+        if self._play_until(lambda: self._find_state() == State.ACTIVE, step, LIMIT):
             return ""
         status = int(self._loop.outputs.get("status_word", 0))
         return self._describe_silence() or (
             f"the controller is not enabled after {LIMIT:g} s: status word 0x{status:04X}, "
             f"{State(self._find_state()).name.lower().replace('_', ' ')}")
 
-    def await_ready(self, demand: float, control: int) -> str:
-        """Wait with the values of set-up, at a `demand` in m, until the controller is ready; why it is not, or ""."""
+    def await_ready(self, demand: float, control: int, main_control: int) -> str:
+        """Wait, at a `demand` in m, until the controller is ready; why it is not, or "".
+
+        A controller that is not ready with the values of set-up and `control`, although it had the time to say so, gets
+        the values of main and `main_control`: it may say that it is ready as soon as it is enabled.
+        """
         def is_ready() -> bool:
             return all(self._has(name, value) for name, value in self._bench.ready.items())
 
         at_rest = CycleInput(0, demand, 0.0, control, is_counted=False)
         self._play(at_rest)
-        if self._play_until(is_ready, lambda: at_rest):
+        self._play_until(is_ready, lambda: at_rest, TIME_TO_SAY)
+        if self._play_until(is_ready, lambda: CycleInput(1, demand, 0.0, main_control, is_counted=False), LIMIT):
             return ""
         details = ", ".join(f"{name} is {self._loop.outputs.get(name, 0.0):g}, not {value:g}"
                             for name, value in self._bench.ready.items() if not self._has(name, value))
-        return self._describe_silence() or (
-            f"the controller is not ready after {LIMIT:g} s with the values of setup: {details}")
+        return self._describe_silence() or f"the controller is not ready after {LIMIT:g} s: {details}"
 
     def _describe_silence(self) -> str:
         missing = describe_missing(self._bench, self._silent, self._loop.describe_refusal())
         return f"{self._bench.describe_node(CONTROLLER)}: {missing}" if self._silent else ""
 
-    def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput]) -> bool:
-        """Play cycles until `is_done()`; False if that takes longer than `LIMIT`, True also when the run is to end."""
-        clock, remaining_cycles = WallClock(), round(LIMIT * 1e9 / self._bench.cycle_ns)
+    def _play_until(self, is_done: Callable[[], bool], make_step: Callable[[], CycleInput], most: float) -> bool:
+        """Play cycles until `is_done()`; False if that takes more than `most` s, True also when the run is to end."""
+        clock, remaining_cycles = WallClock(), round(most * 1e9 / self._bench.cycle_ns)
         while not is_done():
             remaining_cycles -= 1
-            is_over = clock.now() > LIMIT * 1e9 if self._realtime else self._silent >= PATIENCE
+            is_over = clock.now() > most * 1e9 if self._realtime else self._silent >= PATIENCE
             if remaining_cycles < 0 or is_over:
                 return False
             self._play(make_step())
@@ -373,7 +378,8 @@ class BringUp:
         problem = enabling.enable(0.0)
         if problem or not bench.ready:
             return problem
-        return enabling.await_ready(0.0, PROFILES[bench.profile].ladder[find_goal(bench, "setup")])
+        return enabling.await_ready(0.0, *(PROFILES[bench.profile].ladder[find_goal(bench, phase)]
+                                           for phase in ("setup", "main")))
 
     def _identify_nodes(self) -> None:
         """Read and log what the nodes say about themselves; refuse another device, and a firmware that the sequence is

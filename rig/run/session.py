@@ -232,8 +232,8 @@ class Session:
         """Between set-up and main: wait until the controller says that it is ready; False when the run is to end."""
         if not self.job.bench.ready:
             return True
-        control = self._choose_control_word(SETUP, 0)
-        return self._go_on("ready", self._enablings[0][1].await_ready(self._demand, control), CONTROLLER)
+        words = [self._choose_control_word(phase, 0) for phase in (SETUP, MAIN)]
+        return self._go_on("ready", self._enablings[0][1].await_ready(self._demand, *words), CONTROLLER)
 
     def _go_on(self, kind: str, problem: str, node: Role) -> bool:
         """End the run because of a problem of a node; whether it goes on."""

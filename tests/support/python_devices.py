@@ -98,8 +98,8 @@ class CanDevice(PythonDevice):
     """A controller whose frames a DBC describes, encoded and decoded by cantools; it answers the message `on`.
 
     `scale`: m a unit of the positions, A a unit of the current. The signals are named Position (in Demand or on its
-    page), Measured and Current. With Start it is ready, State 5, once that has been 1, and sends a current while it is
-    2; 0 ends both.
+    page), Measured and Current. With Start it is ready, State 5, once that has been 1 or 3, and sends a current while
+    it is 2 or 3; 0 ends both.
     """
 
     def __init__(self, where: str, dbc: str, on: str, position: float, current: float, fd: bool = False) -> None:
@@ -119,8 +119,8 @@ class CanDevice(PythonDevice):
         if definition.name != self._on or "Measured" not in values:  # once a cycle, not for each page
             return []
         start = self._values["Start"]
-        self._state = {0: 0, 1: 5}.get(start, self._state)
-        amperes = (self._state and start == 2) * compute_current(
+        self._state = {0: 0, 1: 5, 3: 5}.get(start, self._state)
+        amperes = (self._state and start >= 2) * compute_current(
             *(self._values[name] * self._position for name in ("Position", "Measured")))
         answer = self._database.get_message_by_name("Drive")
         signals = {each.name: 0 for each in answer.signals} | {
