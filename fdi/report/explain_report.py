@@ -53,7 +53,7 @@ from fdi.report.numbers import (
 )
 from fdi.report.report import Cell, Column, Figure, Line, Listing, Medium, Mood, Report, Section, Table, tabulate
 from fdi.report.run_report import list_faults
-from fdi.thresholds import RESIDUAL_FOREIGN
+from fdi.thresholds import RESIDUAL_FOREIGN, RESIDUAL_HELD_OUT
 from fdi.trace import Floats, Trace
 from plant import Signals
 
@@ -256,17 +256,22 @@ def describe_findings(a: Answer) -> list[Line]:
                 Line("not observable", f"{PLACES[place]}: {why}") for place, why in a.law.hidden.items())]),
             Line("suspicious", describe_suspicious(a.suspicious)),
             Line("another actuator?", doubt + OTHER_ACTUATOR if is_another else ""),
-            Line("held-out run", _describe_undecided(a)), Line("not detectable", describe_blind(a))]
+            Line("held-out run", _describe_held_out(a)), Line("not detectable", describe_blind(a))]
 
 
-def _describe_undecided(a: Answer) -> str:
-    """Why a held-out run was not judged as a whole, if so."""
-    held_out_run = a.explanation.unseen.get(a.best.effects)
-    if held_out_run is None or not held_out_run.decided:
+def _describe_held_out(a: Answer) -> str:
+    """Why a held-out run was not judged as a whole, or what is left of it beside its typical block; "" if neither."""
+    e, effects = a.explanation, a.best.effects
+    outcome, errors = e.unseen.get(effects), e.holdout.get(effects, {})
+    errors = (outcome.decided if outcome else {}) or errors
+    worst = max((x / e.floor[s] for s, x in errors.items() if s in e.floor), default=0.0)
+    if outcome is not None and outcome.decided:
+        return (f"{format_percent(outcome.undecided)} of it is not judged, because stops there depend on a thousandth "
+                f"of a friction level; the rest is at {format_ratio(worst)} times the noise floor")
+    if outcome is None or not outcome.holds or worst <= RESIDUAL_HELD_OUT:
         return ""
-    worst = max(held_out_run.decided[s] / a.explanation.floor[s] for s in held_out_run.decided)
-    return (f"{format_percent(held_out_run.undecided)} of it is not judged, because stops there depend on a "
-            f"thousandth of a friction level; the rest is at {format_ratio(worst)} times the noise floor")
+    return (f"at {format_ratio(worst)} times the noise floor, and at noise in most of it: it holds a stop that the fit "
+            "missed, or an effect that only it shows (rig compare of it says where)")
 
 
 def describe_suspicious(parameters: Sequence[Suspicious], most: int = 4) -> str:
