@@ -171,8 +171,11 @@ class Plant:
         Raises:
             InputError: a segment that is not whole cycles.
         """
-        with explain_errors(str(self.file or self.name), "profile"):
+        try:
             return build_profile(self.profile, rate=1.0 / (period or self.nominal["controller.period"])).command
+        except InputError as error:  # of a segment, which does not know its file
+            field = ", ".join(filter(None, (error.where, error.field)))
+            raise InputError(str(self.file or self.name), field, error.expected) from error
 
     def find_tolerance(self, name: str, q: Quantity) -> float:
         """Scatter of a parameter from unit to unit, as a fraction; 0 where the nominal value is zero."""
