@@ -32,7 +32,7 @@ the thresholds.
 | verdict | always | see below |
 | wave | the verdict is PARTLY, and a wave along the stroke explains more | names no effect |
 | hidden effects | only noise is left | names those that would gain less than {GAIN_DETECTED:g} at any usual size; nothing is missing only if they are at most half of all |
-| law | the verdict is PARTLY or UNEXPLAINED | looks for a law, and describes the residual |
+| law | the verdict is PARTLY or UNEXPLAINED | looks for a law, and describes the residual; one that alone leaves only noise takes the place of effects that do not |
 """  # noqa: E501
 from __future__ import annotations
 

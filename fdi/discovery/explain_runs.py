@@ -83,6 +83,10 @@ def explain_runs(runs: Runs, seed: int = 0, effect_file: str | Path | None = Non
         law_search = find_law_beside(e, progress)
     progress("writing the answer", 0.97)
     law = law_search.law if law_search is not None and law_search.law is not None and law_search.law.holds else None
+    if (law_search is not None and law is not None and e.verdict == "PARTLY" and law_search.base is e.base
+            and law.hypothesis.is_at_floor and not e.ledger[-1].is_at_floor):  # the named effects stood in for it
+        prints = tuple(f.effect for f in e.marks.prints)
+        e = replace(e, verdict="PARTLY" if prints else "UNEXPLAINED", effects=prints)
     file = effect_file or law_file
     names = write_law_file(file, law.terms, law.values, law.reason) if law is not None and file else {}
     shape = None

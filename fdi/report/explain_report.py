@@ -268,7 +268,7 @@ def _describe_held_out(a: Answer) -> str:
     if outcome is not None and outcome.decided:
         return (f"{format_percent(outcome.undecided)} of it is not judged, because stops there depend on a thousandth "
                 f"of a friction level; the rest is at {format_ratio(worst)} times the noise floor")
-    if outcome is None or not outcome.holds or worst <= RESIDUAL_HELD_OUT:
+    if outcome is None or a.verdict not in ("EXPLAINED", "AMBIGUOUS") or worst <= RESIDUAL_HELD_OUT:
         return ""
     return (f"at {format_ratio(worst)} times the noise floor, and at noise in most of it: it holds a stop that the fit "
             "missed, or an effect that only it shows (rig compare of it says where)")
