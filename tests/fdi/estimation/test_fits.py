@@ -225,8 +225,7 @@ def make_problem(trace: Trace) -> Problem:
 
 def fit_nothing(problem: Problem, trace: Trace) -> Fit:
     """The model as it is, as a fit."""
-    free = list_tolerance_unknowns(problem.model)[:1]
-    return linearise(replace(problem, trace=trace, _lanes={}), free, np.zeros(1))
+    return linearise(replace(problem, trace=trace, _lanes={}), list_tolerance_unknowns(problem.model)[:1], np.zeros(1))
 
 
 def test_the_part_that_moves_is_chosen() -> None:

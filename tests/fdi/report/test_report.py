@@ -460,7 +460,7 @@ def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at
     base = SimpleNamespace(is_at_floor=is_at_floor, is_far=False, effects=(), ratio={"xj": 22.5, "p12": 15.0})
     trace = SimpleNamespace(declared=EHA, notes=(), events=())
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, marks=Marks(1.0, 1e-6, ()),
-                                  ledger=[base], unseen={}, excerpt="", ranked=ranked,
+                                  ledger=[base], unseen={}, holdout={}, excerpt="", ranked=ranked,
                                   search=SimpleNamespace(problem=SimpleNamespace(trace=trace)))
     baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
     blind = (Blind("sensor_gain", "sensor_gain.error", 0.02, "1", "a stop"),

@@ -4,7 +4,6 @@ Each is written with canopen or cantools, and each closes the same position loop
 """
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import can
@@ -149,17 +148,22 @@ STARTED = """
 
 
 def start_multiplexed(folder: Path, where: str, phases: str = "setup = 1, main = 2") -> PythonDevice:
-    """29-bit identifiers, 24-bit Motorola values on two pages, a 13-bit Intel current; set-up starts it, or main."""
+    """29-bit identifiers, 24-bit Motorola values on two pages, a 13-bit Intel current; set-up starts it."""
     (folder / "device.dbc").write_text(PAGES_DBC)
     (folder / "bench.toml").write_text(CAN.format(demand="Feedback.Position") + STARTED.replace("PHASES", phases))
     return CanDevice(where, PAGES_DBC, "Feedback", 1e-6, 1e-3)
+
+
+def start_by_main(folder: Path, where: str) -> PythonDevice:
+    """The same; it is ready once main has enabled it."""
+    return start_multiplexed(folder, where, "setup = 0, main = 3")
 
 
 DEVICES = [start_event_driven, start_synchronous, start_every_second, start_can_fd, start_multiplexed]
 # on a CAN interface the examples have identifiers of 11 and of 29 bits (tests/vcan)
 CASES = [*((start, "udp_multicast", True) for start in DEVICES), (start_can_fd, "socketcan", True),
          *((start, "udp_multicast", False) for start in (start_every_second, start_multiplexed)),
-         (partial(start_multiplexed, phases="setup = 0, main = 3"), "udp_multicast", True)]
+         (start_by_main, "udp_multicast", True)]
 
 
 def play(folder: Path, where: str, device: PythonDevice, seed: int = 0) -> tuple[Job, Outcome]:
