@@ -42,8 +42,9 @@ def check_declaration(plant: Plant, where: object) -> None:
     for name, counts in ARGUMENTS.items():
         function = getattr(plant, name)
         if name == "moves" and not callable(function):
-            require(set(function) <= set(plant.state._fields), where, "moves",
-                    f"fields of the state ({', '.join(plant.state._fields)}), not {', '.join(map(str, function))}")
+            unknown = [f for f in function if f not in plant.state._fields]
+            require(not unknown, where, "moves",
+                    f"fields of the state ({', '.join(plant.state._fields)}), not {unknown[:1]}")
         elif function is not None or name in ("step", "measure"):
             require(callable(function) and len(inspect.signature(function).parameters) in counts, where, name,
                     f"a function of {' or '.join(map(str, counts))} arguments")
@@ -136,9 +137,10 @@ class Finding(NamedTuple):
 
 def find_divergence(model: Model, columns: Mapping[str, NDArray[np.float64]]) -> str:
     """Which signal is not a finite number first, and when; empty if all are finite."""
-    for signal in model.kind.signals.columns:
-        if len(bad := np.flatnonzero(~np.isfinite(columns[signal.name]))):
-            return f"{signal.name} is no finite number from t = {bad[0] * model['controller.period']:g} s on"
+    for name, column in columns.items():
+        bad = np.flatnonzero(~np.isfinite(column))
+        if len(bad):
+            return f"{name} is no finite number from t = {bad[0] * model['controller.period']:g} s on"
     return ""
 
 

@@ -170,8 +170,8 @@ def _compare_at_lags(trace: Trace, model: Model, limit: float, com: int, xj: int
     cor, xj_step, com_step = (measure_resolution(trace.column(s.name), s.unit) for s in (
         trace.declared.drive, trace.declared.controlled, trace.declared.command))
     largest = limit if math.isfinite(limit) else float(np.nanmax(np.abs(trace.drive)))
-    floor = max(float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0),
-                1e-7 * largest)  # a firmware may calculate in single precision
+    rounding = float(np.hypot.reduce([cor, gain * xj_step, gain * com_step])) / math.sqrt(12.0)
+    floor = max(rounding, 1e-7 * largest)  # a firmware may calculate in single precision
     comb = find_comb(trace.controlled, FINEST_COMB)
     if comb and is_rounding_left(residual, gain * comb.step, floor):
         # the controller reads the signal finer than the recording holds it
@@ -191,15 +191,17 @@ def find_lags(trace: Trace, limit: float, most_rows: int = 60_000) -> tuple[int,
     rows = rows[::max(1, len(rows) // most_rows)]
     if not trace.drive[rows].any():  # always at its limit, or 0
         return 0, 0, math.nan
-    whole = np.column_stack([*(x[rows - lag] for x in (trace.command, sensed) for lag in LAGS), trace.drive[rows]])
+    columns = [x[rows - lag] for x in (trace.command, sensed) for lag in LAGS]
+    whole = np.column_stack([*columns, trace.drive[rows]])
     gram = np.einsum("ki,kj->ij", whole, whole)
-    n = len(LAGS)
+    n, target = len(LAGS), gram[-1, -1]
     best = (math.inf, 0, 0, math.nan)
     for a in range(n):
         for b in range(n):
             pick = [a, n + b]
-            gains = np.linalg.lstsq(gram[np.ix_(pick, pick)], gram[pick, -1], rcond=None)[0]
-            misfit = float(gram[-1, -1] - gains @ gram[pick, -1])
+            left, right = gram[np.ix_(pick, pick)], gram[pick, -1]
+            gains = np.linalg.lstsq(left, right, rcond=None)[0]
+            misfit = float(target - gains @ right)
             if misfit < best[0] * (1 - 1e-9) - 1e-30 * (abs(LAGS[a]) + abs(LAGS[b])):
                 best = (misfit, LAGS[a], LAGS[b], float(gains[0]))
     return best[1], best[2], best[3]

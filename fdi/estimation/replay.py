@@ -43,7 +43,7 @@ from fdi.thresholds import (
     SOLVER_ERROR_SHARE,
 )
 from fdi.trace import Flags, Floats, Trace, bridge_gaps, fill_gaps, find_comb, hold_last, hold_next, rms
-from plant import EHA, MODULES, InputError, Lanes, Model, compute_answers, require, rest_controller
+from plant import EHA, MODULES, InputError, Lanes, Model, compute_answers, find_divergence, require, rest_controller
 
 Columns = dict[str, Floats]  # by signal, (n,)
 
@@ -87,10 +87,9 @@ def require_finite_replay(trace: Trace, model: Model) -> None:
     Raises:
         InputError: such a model.
     """
-    for name, output in replay_current(trace, model, max(REPLAY_STEPS, model.steps)).items():
-        bad = np.flatnonzero(~np.isfinite(output))
-        require(not len(bad), model.name, name, "a plant that stays finite; with the measured "
-                f"{trace.declared.drive.name} it is no finite number from t = {trace.t[bad[:1]].sum():g} s on")
+    diverged = find_divergence(model, replay_current(trace, model, max(REPLAY_STEPS, model.steps)))
+    require(not diverged, model.name, "",
+            f"a plant that stays finite; with the measured {trace.declared.drive.name}, {diverged}")
 
 
 def measure_misfit(trace: Trace, model: Model) -> float:
@@ -701,8 +700,9 @@ def _take_rows(trace: Trace, outputs: Sequence[str]) -> Trace:
     if jitter > 0.1 * trace.period:
         trace = trace.with_notes(
             f"times are up to {1e3 * jitter:.2g} ms off an even grid; each row is taken as one cycle")
+    nothing = np.full(len(trace), np.nan)
     # the controller's block and the anchor of a replay need the controlled signal, chosen or not
-    unused_columns = {name: np.full(len(trace), np.nan) for name in trace.output_names[1:] if name not in outputs}
+    unused_columns = {name: nothing for name in trace.output_names[1:] if name not in outputs}
     return trace.with_columns(unused_columns, filled=np.zeros(len(trace), bool), incomplete=_find_incomplete(trace),
                               outputs=tuple(outputs))
 
@@ -886,11 +886,12 @@ def has_same_command(one: Trace, other: Trace, late: int = 0, overlap: float = 0
 
     It is not if these are less than `overlap` of the one.
     """
-    first, last = max(0, late), min(len(one), len(other) + late)
-    if last - first < overlap * len(one):
+    a, b = one.command, other.command
+    first, last = max(0, late), min(len(a), len(b) + late)
+    if last - first < overlap * len(a):
         return False
-    return bool(np.mean(np.abs(one.command[first:last] - other.command[first - late:last - late])
-                        <= SAME_COMMAND_POSITION * one.scale) >= same_share)
+    is_same = np.abs(a[first:last] - b[first - late:last - late]) <= SAME_COMMAND_POSITION * one.scale
+    return bool(np.mean(is_same) >= same_share)
 
 
 def _align_repeat(trace: Trace, late: int, rows: int) -> Trace:

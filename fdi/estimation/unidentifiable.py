@@ -195,7 +195,8 @@ def find_tangents(problem: Problem, free: Sequence[Free], x: Floats) -> tuple[li
     trials = np.array([[scale_together(free, x, each.powers, TRIED * share) for each in directions]
                        for share in TRIED_SHARES])
     is_tried = ((trials >= low - 1e-9) & (trials <= high + 1e-9)).all(axis=2) & (trials != x).any(axis=2)
-    limits = np.array([each.allowed for each in directions]) * sum(map(len, (problem.trace, *problem.also))) / 13500.0
+    samples = sum(len(trace) for trace in (problem.trace, *problem.also))
+    limits = np.array([each.allowed for each in directions]) * samples / 13500.0
     flat_directions = [directions[k] for k in np.flatnonzero(confirm_flat(problem, free, x, trials, is_tried, limits))]
     ways = _list_tangents(free, x, flat_directions)
     places = _find_independent(ways)
@@ -627,7 +628,7 @@ def follow_profile(problem: Problem, fit: Fit, k: int, end: float, more: float) 
     A valley may bend, so a step goes on along the last one and is cut until the fit follows. What lies behind a ridge
     at which every step fails is tried as well.
     """
-    fits, share, f = [fit], 0.25 / PROFILE_CUT, fit.free[k]
+    fits, share, f = [fit], 1.0, fit.free[k]
     shortest = PROFILE_SHORTEST * (f.high - f.low) / f.scale
 
     def fit_at(place: float) -> Fit:

@@ -115,8 +115,8 @@ class Command(NamedTuple):
 
 def find_work(name: str) -> Callable[[Any], int]:
     """Import the module of a command; give the function that does its work."""
-    work: Callable[[Any], int] = import_module(
-        f"rig.cli.commands.{name}{'_' if keyword.iskeyword(name) else ''}").run_command
+    module = import_module(f"rig.cli.commands.{name}{'_' if keyword.iskeyword(name) else ''}")
+    work: Callable[[Any], int] = module.run_command
     return work
 
 

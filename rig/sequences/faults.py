@@ -304,8 +304,8 @@ class Plan:
 
     def to_json(self) -> dict[str, Any]:
         """What `from_json` makes a plan of: plain dicts, lists, numbers and texts."""
-        return {"faults": [{"kind": f.kind, **{k: v for k, v in asdict(f).items() if v is not None}}
-                           for f in self.faults], "start": self.start, "stop": self.stop, "seed": self.seed,
+        faults = [{"kind": f.kind, **{k: v for k, v in asdict(f).items() if v is not None}} for f in self.faults]
+        return {"faults": faults, "start": self.start, "stop": self.stop, "seed": self.seed,
                 "rate": self.rate}
 
     @classmethod

@@ -61,9 +61,9 @@ class PythonSegment(PythonPart, Timed):
             values = np.asarray(returned, dtype=np.float64)
         except (TypeError, ValueError):
             values = np.empty(0)
-        require(values.shape == t.shape and np.isfinite(values).all(), "segment", "python",
-                f"a function that returns {len(t)} finite numbers, one for each time; "
-                f"{self.python} returned {describe_value(returned)}")
+        is_whole = values.shape == t.shape and bool(np.isfinite(values).all())
+        require(is_whole, "segment", "python", f"a function that returns {len(t)} finite numbers, one for each time; "
+                                    f"{self.python} returned {describe_value(returned)}")
         return values
 
 

@@ -182,7 +182,8 @@ class Sequence:
     def load_profile(self) -> Array:
         """The load, SI, for every cycle of main."""
         force, _, end = build_profile(self.load, rate=self.rate)
-        return np.concatenate((force, np.full(round(self.duration * self.rate) - len(force), end)))
+        cycles = round(self.duration * self.rate)
+        return np.concatenate((force, np.full(cycles - len(force), end)))
 
     def plan(self, seed: int) -> Plan:
         """The faults by cycle of the run."""
@@ -193,8 +194,8 @@ class Sequence:
     @property
     def loses_frames(self) -> bool:
         """Whether a fault keeps frames from arriving."""
-        return any(isinstance(fault, (faults.Lost, faults.Late, faults.Corrupted, faults.Short, faults.BusOff,
-                                      faults.Reset)) for fault in self.faults)
+        lossy = (faults.Lost, faults.Late, faults.Corrupted, faults.Short, faults.BusOff, faults.Reset)
+        return any(isinstance(fault, lossy) for fault in self.faults)
 
     @property
     def disturbs_bus(self) -> bool:
@@ -317,8 +318,8 @@ def write_preflight(kind: Plant) -> str:
     """
     command = kind.build_nominal_command()
     span = float(f"{np.ptp(np.append(command, 0.0)):.3g}")
-    return fill_template("sequences/preflight.jinja", kind=kind, span=span, most_error=MOST_FOLLOWING_ERROR, rest=(
-        list_section_names(kind.profile)[-1] if isinstance(kind.profile[-1], Hold) else ""))
+    rest = list_section_names(kind.profile)[-1] if isinstance(kind.profile[-1], Hold) else ""
+    return fill_template("sequences/preflight.jinja", kind=kind, span=span, rest=rest, most_error=MOST_FOLLOWING_ERROR)
 
 
 def _fill_in_files(sequence: Sequence, place: Place, read_file: ReadFile) -> Sequence:
@@ -362,8 +363,8 @@ def _read_column(file: str, read: Callable[[str, Place, str], bytes], phase: str
         raise here.refuse(f"{expected}; {error}") from error
     values = columns.get("value" if phase == "load" or "com" not in columns else "com")
     if values is None:
-        raise here.refuse("a file with the columns t and "
-                          f"{'value' if phase == 'load' else find_tested().command.name}")
+        command = find_tested().command.name
+        raise here.refuse(f"a file with the columns t and {'value' if phase == 'load' else command}")
     return tuple(values.tolist())
 
 

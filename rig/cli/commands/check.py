@@ -20,8 +20,8 @@ def run_command(args: argparse.Namespace) -> int:
     if args.sequence.endswith(".py"):
         return check_plant(args)
     if is_fault_file(Path(args.sequence)):
-        return give_answer(build_list_report("faults", "Measure them with rig fdi TRACE --faults FILE.",
-                                             list_faults(load_chosen_model(args), args.sequence)), args)
+        faults = list_faults(load_chosen_model(args), args.sequence)
+        return give_answer(build_list_report("faults", "Measure them with rig fdi TRACE --faults FILE.", faults), args)
     places = choose_places(args, "", args.sequence if Path(args.sequence).is_file() else "")
     choice = JobChoice(args.sequence, args.model, parse_changes(args.set), args.seed, tuple(args.effects),
                        args.bench)
@@ -51,11 +51,11 @@ def check_plant(args: argparse.Namespace) -> int:
     sentence = (f"{kind.title or kind.name}: {count_nouns(len(kind.state._fields), 'state')}, "
                 f"{count_nouns(len(kind.nominal), 'parameter')}, {count_nouns(len(kind.effects), 'own effect')}, "
                 f"{count_nouns(len(kind.faults), 'fault')}")
+    lines = [Line(f.check, f.text, "good" if f.passed else "bad") for f in findings]
     signals = Table([Column("signal"), Column("role"), Column("unit"), Column("content")],
                     [[s.name, s.role, s.unit, s.quantity] for s in kind.signals])
     report = Report("check", args.sequence, verdict, "bad" if failures else "good", sentence, sections=[
-        Section("Checks", [Line(f.check, f.text, "good" if f.passed else "bad") for f in findings]),
-        Section("Signals", [signals])], files=places.files,
+        Section("Checks", lines), Section("Signals", [signals])], files=places.files,
         next_command=f"rig simulate --model {args.sequence}",
         data={"verdict": verdict, "file": args.sequence, "plant": kind.name,
               "checks": [f._asdict() for f in findings]})

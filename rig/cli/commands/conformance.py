@@ -40,8 +40,8 @@ def run_command(args: argparse.Namespace) -> int:
     with open_wire(name, bus) as wire, show_progress(args) as progress:
         target = Target(wire, sheet, options)
         outcome = run_cases(target, cases, progress)
-    return give_answer(build_conformance_report(outcome, target, bus, places.files), args,
-                       {"PASS": 0, "FAIL": 1, "INVALID_TIMING": 3}[outcome.verdict], places,
+    status = {"PASS": 0, "FAIL": 1, "INVALID_TIMING": 3}[outcome.verdict]
+    return give_answer(build_conformance_report(outcome, target, bus, places.files), args, status, places,
                        partial(write_junit, outcome, node))
 
 

@@ -33,8 +33,8 @@ def build_listening_report(bench: Bench, spec: str, seconds: float) -> Report:
     counts, others = doctor.count_frames(bench, doctor.listen(bench, spec, seconds))
     findings = list(doctor.judge_frames(bench, counts, others, seconds))
     is_there = any(each.status == "ok" for each in findings if each.purpose.startswith("controller"))
-    return build_report(bench.name, findings, f"The controller is on {spec}." if is_there else
-                        f"Nothing of the controller is heard on {spec}.", is_good=is_there)
+    sentence = f"The controller is on {spec}." if is_there else f"Nothing of the controller is heard on {spec}."
+    return build_report(bench.name, findings, sentence, is_good=is_there)
 
 
 def build_doctor_report(findings: Sequence[doctor.Finding]) -> Report:

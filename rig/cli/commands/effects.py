@@ -25,8 +25,8 @@ def run_command(args: argparse.Namespace) -> int:
     with show_progress(args, "testing"):
         tests = {e.name: test_effect(e, plant) for e in effects if args.test or is_own}
     report = build_effects_report(effects, plant, tests, is_detailed=bool(args.name))
-    return give_answer(report, args, int(any(test.faults for test in tests.values())),
-                       Places(answer=Path(args.out) if args.out else None))
+    status = int(any(test.faults for test in tests.values()))
+    return give_answer(report, args, status, Places(answer=Path(args.out) if args.out else None))
 
 
 def test_effect(e: Effect, plant: str = "eha") -> SelfTest:

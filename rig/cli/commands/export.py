@@ -36,5 +36,5 @@ def write_fmu(args: argparse.Namespace) -> int:
     with show_progress(args, "compiling"):
         platforms = export_fmu(model, out, args.fmi, args.seed)
     sentence = f"{out}: {model.name} as FMI {args.fmi}.0 co-simulation for {', '.join(platforms)}"
-    return give_answer(Report("export", str(out), sentence=sentence, data={
-        "path": str(out), "count": 1, "fmi": args.fmi, "platforms": platforms}), args)
+    data = {"path": str(out), "count": 1, "fmi": args.fmi, "platforms": platforms}
+    return give_answer(Report("export", str(out), sentence=sentence, data=data), args)
