@@ -26,6 +26,7 @@ the thresholds.
 | solver | half the step changes more than {SOLVER_ERROR_SHARE:g} floors | finishes again with 50 steps a cycle |
 | tolerances | the best leaves only noise, with far tolerances | takes these back in eighths, with each of four effects in their place; keeps those that end near |
 | intervals, again | the squares of the sizes of one of several effects are below {GAIN_CONVINCES:g} variances | leaves it out, if the others leave only noise; one without such an interval not where they then have far tolerances |
+| own effects | nothing is missing, but only with other sizes of effects that the model has | names those |
 | whole recording | only an excerpt was fitted | judges on all rows |
 | left-out rows | the replay has an observer | judges on all rows that hang on no stop, as on a held-out run |
 | held-out run | there is one | rejects an effect that leaves more than {RESIDUAL_HELD_OUT:g} floors in the typical block; up to {HELD_OUT_UNDECIDED_SHARE:g} of the run may be undecided |
@@ -263,6 +264,8 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     others = search.map_parallel(search.replay_hypothesis,
                                  (h for h in level if h.effects not in [c.effects for c in close]))
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
+    if not close and (own := search.hold_own_effects(base)):
+        base, *close = own
     base, *close = (judge_left_out_rows(search, h, floor) for h in search.judge_on_all([base, *close], FINE))
     ledger = [base, *parents, *close[:1]]
     hypotheses = [*ledger, *close[1:], *others[:3]]

@@ -36,6 +36,7 @@ from fdi.estimation import (
     leave_out_rest,
     leave_out_rows,
     linearise,
+    list_active_effects,
     list_all_unknowns,
     list_directions,
     list_effect_unknowns,
@@ -179,6 +180,29 @@ class Search:
         if first.is_at_floor:
             return first
         return self.retry_from(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
+
+    def hold_own_effects(self, base: Hypothesis) -> list[Hypothesis]:
+        """A base that leaves only noise as its model has it, and those of its own effects that leave only noise at
+        another size, best first; all of them together where none does alone.
+
+        [] where the model leaves only noise with its own sizes, or has none to fit.
+        """
+        own = {effect: self.model.find_effect(effect).fitted for effect in list_active_effects(self.model)}
+        fitted = {name for names in own.values() for name in names} & {f.name for f in base.fit.free}
+        if not base.is_at_floor or not fitted:
+            return []
+
+        def fit_alone(effects: tuple[str, ...]) -> Hypothesis:
+            held = fitted.difference(*(own[effect] for effect in effects))
+            unknowns = [(f, v) for f, v in zip(base.fit.free, base.fit.x, strict=True) if f.name not in held]
+            fit = fit_unknowns(self.problem, [f for f, _ in unknowns], np.array([v for _, v in unknowns]))
+            return self.finish_hypothesis(self.judge_fit(effects, fit), 2)
+
+        given, *single = self.map_parallel(fit_alone, [(), *((effect,) for effect in own if fitted & {*own[effect]})])
+        if given.is_at_floor or given.cost <= base.cost + GAIN_SEEN:
+            return []
+        enough = sorted((h for h in single if h.is_at_floor), key=lambda h: h.cost)
+        return [given, *(enough or [replace(base, effects=tuple(own))])]
 
     def find_eased_start(self, free: Sequence[Free], x: Floats | None = None, rounds: int = 4) -> Floats:
         """Where a fit gets to, (p,), that takes the noise for larger at first: priors hold it, small events vanish.

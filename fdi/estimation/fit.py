@@ -398,6 +398,7 @@ def silence_readings(model: Model) -> Model:
     return silence_sensors(model).replace({name: value for e in readings for name, value in e.off.items()})
 
 
+LEAST_SLOPE_SQUARE = 1e-6  # of an unknown over one of its scales, all residuals together: less is not seen
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 FIT_ROUNDS = 12
 
@@ -553,7 +554,9 @@ def step_within_bounds(fit: Fit, hessian: Floats, gradient: Floats, dampings: Se
     low, high = scaled_bounds(fit.free)
     diagonal = np.outer(dampings, np.diag(hessian)) + 1e-12 * np.trace(hessian) + 1e-12
     damped_hessian = hessian + diagonal[:, None, :] * np.eye(len(gradient))
-    x, is_open = np.tile(fit.x, (len(dampings), 1)), np.ones((len(dampings), len(fit.x)), bool)
+    x = np.tile(fit.x, (len(dampings), 1))
+    # what changes nothing has a slope of rounding errors, which would carry it anywhere
+    is_open = np.tile(np.diag(hessian) > LEAST_SLOPE_SQUARE, (len(dampings), 1))
     for _ in fit.x:
         bound_steps = np.where(is_open, 0.0, x - fit.x)
         matrix = np.where(is_open[:, :, None] & is_open[:, None, :], damped_hessian,

@@ -18,7 +18,7 @@ from fdi.discovery.runs import Source
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.sensitivity import NEEDED, RUNGS, TRIALS, Claim
 from fdi.discovery.update_model import ModelUpdate, Row
-from fdi.estimation import Value
+from fdi.estimation import Value, list_active_effects
 from fdi.report.compare_report import OTHER_ACTUATOR, describe_gains
 from fdi.report.drawing import (
     AFTER,
@@ -172,7 +172,11 @@ def describe_verdict(a: Answer) -> str:
             return _describe_unexplained(a)
     rest = f"{_describe_sizes(candidates)}; {_describe_change(a, candidates[-1])}."
     if a.verdict == "EXPLAINED":
-        return f"{words} {'together ' if len(candidates) > 1 else ''}{verb} the residual: {rest}"
+        model = a.explanation.search.model
+        own = [f"{name_parameter(name)} {format_amount(model[name], v.unit)}" for c in candidates
+               if c.effect in list_active_effects(model) for name, v in c.parameters.items()]
+        has = f" The model has it with {join_words(own)}." if own else ""
+        return f"{words} {'together ' if len(candidates) > 1 else ''}{verb} the residual: {rest}{has}"
     if a.best.is_at_floor and a.best.is_far:
         return f"{words} {verb} the residual {FAR_OFF}: {rest} Something else may be missing instead."
     return f"{words} {verb} part of the residual: {rest} Something else is missing too."

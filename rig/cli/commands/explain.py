@@ -9,6 +9,7 @@ from fdi.discovery.explain_runs import Answer, explain_runs, list_shared_effects
 from fdi.discovery.residual_pattern import can_balance
 from fdi.discovery.runs import Runs, read_runs
 from fdi.discovery.sensitivity import Claim, describe_unit
+from fdi.estimation import list_active_effects
 from fdi.progress import Progress
 from fdi.report import build_explanation_report
 from plant import require
@@ -82,6 +83,11 @@ def choose_next_command(args: argparse.Namespace, answer: Answer, effect_file: s
             return f"rig explain {arguments} --write-effect missing.py"
         both = (*answer.law.base.effects, *answer.law_effects)
         return f"rig add {' '.join(both)} {arguments} --effects {effect_file}"
+    own = list_active_effects(answer.explanation.search.model)
+    values = {name: v.value for c in answer.candidates if c.effect in {*own} & {*effects}
+              for name, v in c.parameters.items()}
+    if values:
+        return f"rig explain {arguments} {' '.join(f'--set {name}={value:.6g}' for name, value in values.items())}"
     if answer.verdict in ("EXPLAINED", "PARTLY", "AMBIGUOUS") and effects:
         shared_effects = list_shared_effects(answer.explanation)
         names = effects if answer.verdict != "AMBIGUOUS" else dict.fromkeys([*shared_effects, *answer.best.effects])

@@ -160,6 +160,16 @@ def test_a_recorder_that_rounds_positions_is_no_effect() -> None:
         "EXPLAINED", ("sensor_lag",)) and explanation.marks.is_recorder
 
 
+def test_an_effect_that_the_model_has_at_another_size_is_named() -> None:
+    """NOTHING_MISSING was the answer: the fit had moved the friction to where the unit has it, and nobody was told."""
+    runs = [hold_inputs(record_plant({}, SHORT, seed)) for seed in (1, 2)]
+    with restored_catalogue(*SEARCHED):
+        e = explain(Model().replace({"jack.static_friction": 600.0, "jack.dynamic_friction": 300.0}), runs[0], runs[1:])
+    values = [e.ranked[0].fit.values[f"jack.{kind}_friction"] for kind in ("static", "dynamic")]
+    assert (e.verdict, e.effects, e.base.is_at_floor) == ("EXPLAINED", ("jack_friction",), False)
+    assert values == pytest.approx([800.0, 500.0], rel=0.05)
+
+
 def test_a_wave_over_the_position_and_a_curve_over_the_speed_are_found() -> None:
     rng = np.random.default_rng(3)
     t = np.arange(13_000) * 1e-3
