@@ -56,6 +56,7 @@ from fdi.estimation import (
     find_unpredictable_rows,
     fit_unknowns,
     has_controller_memory,
+    list_tolerance_sizes,
     replay_fit,
 )
 from fdi.progress import Progress, Stage, ignore_progress
@@ -409,14 +410,14 @@ def shows_effect(model: Model, h: Hypothesis, effect: str, least_sd: float = INT
     """Whether a size of an effect is so many standard deviations from its off value, by default those of 95 %.
 
     If none is, the fit is better only by a stop that it met by chance. A frequency or a speed at which an effect of
-    next to no size happens to help is no size.
+    next to no size happens to help is no size, and a mass that a healthy unit may have is not missing.
     """
     entry = model.find_effect(effect)
-    values = h.fit.values
+    values, tolerances = h.fit.values, list_tolerance_sizes(model)
     sizes = [name for name in entry.fitted
              if entry.off.get(name, 0.0) == 0.0 and entry.parameters[name].unit not in WITHOUT_SIZE]
-    return any(abs(values[name] - entry.off.get(name, model.nominal.get(name, 0.0))) > least_sd * h.fit.spread(name)
-               for name in sizes or entry.fitted)
+    return any(abs(values[name] - entry.off.get(name, model.nominal.get(name, 0.0)))
+               > max(least_sd * h.fit.spread(name), tolerances.get(name, 0.0)) for name in sizes or entry.fitted)
 
 
 def sort_by_cost(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:

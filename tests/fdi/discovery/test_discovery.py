@@ -238,18 +238,18 @@ def test_a_held_out_run_may_lack_signals(search: Search) -> None:
     assert search.make_problem(hold_inputs(record_plant(BIAS, COMMAND), ["xs"]), 20).noise == search.problem.noise[-1:]
 
 
-def test_an_effect_counts_only_if_its_interval_leaves_out_the_off_value(search: Search) -> None:
-    """Of a null bias of 100 uA: its own size does, a hundredth of its standard deviation does not."""
+@pytest.mark.parametrize(("effect", "name", "value", "sd", "shown"), [
+    ("null_bias", "null_bias.current", 1e-4, 1.0, True), ("null_bias", "null_bias.current", 1e-8, 1.0, False),
+    ("moving_mass", "jack.mass", 100.1, 0.0, False)])
+def test_an_effect_counts_only_if_its_interval_leaves_out_the_off_value(search: Search, effect: str, name: str,
+                                                                        value: float, sd: float, shown: bool) -> None:
+    """A null bias of 100 uA does, one of a part of its standard deviation does not, nor a mass of a healthy unit."""
     free = list_all_unknowns(search.model)
-    place = [f.name for f in free].index("null_bias.current")
+    place = [f.name for f in free].index(name)
     fit = linearise(search.problem, free, np.zeros(len(free)))
-
-    def move_bias(current: float) -> Hypothesis:
-        x = np.where(np.arange(len(free)) == place, (current - free[place].centre) / free[place].scale, fit.x)
-        return search.judge_fit(("null_bias",), replace(fit, x=x))
-
-    small = 0.01 * fit.spread("null_bias.current")
-    assert [shows_effect(load_model(), move_bias(current), "null_bias") for current in (1e-4, small)] == [True, False]
+    x = np.where(np.arange(len(free)) == place, (value - free[place].centre) / free[place].scale, fit.x)
+    h = search.judge_fit((effect,), replace(fit, x=x, covariance=sd * fit.covariance))
+    assert shows_effect(load_model(), h, effect) is shown
 
 
 def test_of_two_effects_the_one_that_may_be_off_is_left_out() -> None:
