@@ -84,10 +84,11 @@ def choose_next_command(args: argparse.Namespace, answer: Answer, effect_file: s
         both = (*answer.law.base.effects, *answer.law_effects)
         return f"rig add {' '.join(both)} {arguments} --effects {effect_file}"
     own = list_active_effects(answer.explanation.search.model)
-    values = {name: v.value for c in answer.candidates if c.effect in {*own} & {*effects}
+    values = {name: f"{name}={v.value:.6g}" for c in answer.candidates if c.effect in {*own} & {*effects}
               for name, v in c.parameters.items()}
     if values:
-        return f"rig explain {arguments} {' '.join(f'--set {name}={value:.6g}' for name, value in values.items())}"
+        settings = [*(each for each in args.set or () if each.split("=")[0] not in values), *values.values()]
+        return f"rig explain {format_arguments(argparse.Namespace(**vars(args) | {'set': settings}))}"
     if answer.verdict in ("EXPLAINED", "PARTLY", "AMBIGUOUS") and effects:
         shared_effects = list_shared_effects(answer.explanation)
         names = effects if answer.verdict != "AMBIGUOUS" else dict.fromkeys([*shared_effects, *answer.best.effects])
