@@ -27,11 +27,12 @@ _SETTLING = 100  # cycles: after a lost frame the position loop needs less than 
 
 
 class Injected(NamedTuple):
-    """Cycles that the faults of the sequence itself disturb, masks of shape (cycles,)."""
+    """Cycles that the faults of the sequence itself disturb, columns of shape (cycles,)."""
 
     sync: Mask  # SYNC, or the whole bus
     plant: Mask  # feedback or valve state
-    any: Mask  # any frame or heartbeat, now or a moment ago
+    fault: NDArray[np.int64]  # number of the fault that disturbs any frame or heartbeat, now or a moment ago; 0: none
+    labels: tuple[str, ...] = ()  # of the faults, from number 1 on
 
 
 class CycleRecords(NamedTuple):
@@ -321,15 +322,22 @@ def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[D
         if node in gone_nodes and records.find_stop(node) <= cycle + 1:  # later it still answered
             role = Role(node)
             return _describe_stop(role, bench, records, min(origin, records.find_stop(node)), cycle, gone_nodes[role])
-    window = records.injected.any[max(origin - 1, 0):cycle + 1]
-    if window.any() and trouble.kind != "guard":
-        return own_cause._replace(source=0, kind="injected", cycle=max(origin - 1, 0) + int(np.argmax(window)),
-                                  text="a fault of the sequence disturbs frames")
+    if records.injected.fault[max(origin - 1, 0):cycle + 1].any() and trouble.kind != "guard":
+        return _describe_injected(records.injected, cycle)
     for disturbance in disturbances:
         reach = disturbance.reach + (_SETTLING if trouble.kind == "guard" else 0)
         if any(disturbance.first - 1 <= at <= reach for at in (origin, cycle)):
             return Cause(disturbance.source, "late", disturbance.first, disturbance.text)
     return _describe_stop(Role(silent), bench, records, origin, cycle, "") if silent else own_cause
+
+
+def _describe_injected(injected: Injected, cycle: int) -> Cause:
+    """The last fault of the sequence that disturbs frames up to `cycle`, from where it began to do so."""
+    number = injected.fault[:cycle + 1][injected.fault[:cycle + 1] != 0][-1]
+    first = _find_run_start(injected.fault != 0, cycle, near=cycle)
+    first += int(np.argmax(injected.fault[first:] == number))
+    return Cause(0, "injected", first, "a fault of the sequence disturbs frames",
+                 (f"fault {injected.labels[number - 1]!r} acts on them from cycle {first}",))
 
 
 def _is_communication(trouble: Trouble) -> bool:
@@ -410,21 +418,23 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
         heartbeat_limit: s after which a lost heartbeat has been reported.
         watchdog_limit: cycles after which missing frames have been reported.
     """
-    sync, plant, anything = (np.zeros(cycles, dtype=bool) for _ in range(3))
+    sync, plant = np.zeros(cycles, dtype=bool), np.zeros(cycles, dtype=bool)
+    number_of_fault = np.zeros(cycles, dtype=np.int64)
     silence, cycle_ns = round(heartbeat_limit * plan.rate), round(1e9 / plan.rate)
-    for fault in plan.faults:
+    for number, fault in enumerate(plan.faults, 1):
         first, last = plan.find_cycles(fault)
         frame = getattr(fault, "frame", "")
         if not frame and not isinstance(fault, Parameter | Offset | Stuck):
-            anything[first:last + silence] = True
+            number_of_fault[first:last + silence] = number
             sync[first:last + watchdog_limit] |= not isinstance(fault, Silent)
             plant[first:last + 1] |= isinstance(fault, BusOff)
         for k in range(first, min(last, cycles) if frame else first):
             action = schedule.find_action(frame, k)
             if action.code:
                 last_hit = k - (-action.argument // cycle_ns) if action.code == DELAY else k
-                anything[k:last_hit + watchdog_limit] = True
+                number_of_fault[k:last_hit + watchdog_limit] = number
                 plant[k:last_hit + 1] |= frame in ("feedback", "valve_state", "sync")
                 sync[k:last_hit + 1] |= frame == "sync"
-                anything[k:k + silence] |= frame == "sync"
-    return Injected(sync, plant, anything)
+                if frame == "sync":
+                    number_of_fault[k:k + silence] = number
+    return Injected(sync, plant, number_of_fault, tuple(fault.label for fault in plan.faults))

@@ -36,7 +36,7 @@ class Script:
         self.lateness = np.full(N, 2e-5)
         self.feedback, self.valve, self.response = np.full(N, 1e-4), np.full(N, 1.1e-4), np.full(N, 2e-4)
         self.flags = np.zeros(N, dtype=np.int64)
-        self.injected = np.zeros((3, N), dtype=bool)
+        self.injected = np.zeros((3, N), dtype=np.int64)
         self.delay = np.full(N, 1e-5)
         self.troubles: list[Trouble] = []
 
@@ -60,8 +60,8 @@ class Script:
     def stall(self, cycle: int, seconds: float) -> None:
         self.delay[cycle] = seconds
 
-    def inject(self, first: int, last: int) -> None:
-        self.injected[2, first:last] = True
+    def inject(self, first: int, last: int, number: int = 1) -> None:
+        self.injected[2, first:last] = number
 
     def spoil(self, steps: list[tuple[Any, ...]]) -> Script:
         for name, *arguments in steps:
@@ -71,7 +71,8 @@ class Script:
     def attribute(self, gone_nodes: Mapping[Role, str] | None = None, policy: TimingPolicy = POLICY) -> Attribution:
         due = np.arange(N, dtype=np.int64) * MS
         records = CycleRecords(due, self.lateness, self.feedback, self.valve, self.response, self.flags,
-                               Injected(*self.injected), self.delay)
+                               Injected(self.injected[0] != 0, self.injected[1] != 0, self.injected[2],
+                                        ("lost drive", "lost heartbeat")), self.delay)
         return attribute(records, self.troubles, policy, load_bench(), gone_nodes or {})
 
 
@@ -149,6 +150,15 @@ CASES: dict[str, tuple[list[tuple[Any, ...]], dict[int, str], tuple[int, str, in
         (PLANT, "emcy", 600), ""),
     "a fault of the sequence": (
         [("inject", 600, 607), ("lose_drive", 600, 603), MISSED], {}, (0, "injected", 600), ""),
+    "a heartbeat lost 264 cycles ago": (
+        [("inject", 340, 900, 2), ("report", 604.0, PLANT, 0x8130)], {}, (0, "injected", 340),
+        "frames; fault 'lost heartbeat' acts on them from cycle 340"),
+    "a heartbeat lost long ago, with frames lost meanwhile": (
+        [("inject", 340, 900, 2), ("inject", 500, 510), ("report", 604.0, PLANT, 0x8130)], {}, (0, "injected", 340),
+        "'lost heartbeat'"),
+    "frames lost while a heartbeat is": (
+        [("inject", 340, 900, 2), ("inject", 600, 607), ("lose_drive", 600, 603), MISSED], {}, (0, "injected", 600),
+        "'lost drive' acts on them from cycle 600"),
     "a guard passed because frames were late": ([("lose_feedback", 600, 605), GUARD], {}, (PLANT, "late", 600), ""),
     "a guard": ([GUARD], {}, (0, "guard", 650), ""),
     "only a heartbeat is missing": (
@@ -166,7 +176,8 @@ def test_the_first_cause(case: str) -> None:
     attribution = script.attribute(gone_nodes)
     assert attribution.cause is not None and cause == (
         attribution.cause.source, attribution.cause.kind, attribution.cause.cycle)
-    assert words in attribution.cause.text and attribution.cause.is_gone is (attribution.cause.source in gone_nodes)
+    assert (words in "; ".join([attribution.cause.text, *attribution.cause.evidence])
+            and attribution.cause.is_gone is (attribution.cause.source in gone_nodes))
     own_troubles = sum(trouble.text == attribution.cause.text for trouble in script.troubles)
     assert (len(attribution.consequences) == len(script.troubles) - own_troubles
             and attribution.by_bench >= attribution.cause.is_lateness)
@@ -209,7 +220,7 @@ def test_the_plants_record_is_matched_by_cycle() -> None:
 def test_a_run_without_cycles() -> None:
     empty, mask = np.zeros(0), np.zeros(0, dtype=bool)
     records = CycleRecords(np.zeros(0, dtype=np.int64), empty, empty, empty, empty, np.zeros(0, dtype=np.int64),
-                           Injected(mask, mask, mask), empty)
+                           Injected(mask, mask, np.zeros(0, dtype=np.int64)), empty)
     attribution = attribute(records, [Trouble(0, CONTROLLER, "bring_up", 0, "slow")], POLICY, load_bench(),
                             {PLANT: "gone"})
     assert attribution.cause is not None and attribution.cause.source == CONTROLLER and len(attribution.judged) == 0
@@ -224,5 +235,5 @@ def test_a_run_without_cycles() -> None:
 ])
 def test_cycles_that_faults_disturb(fault: Fault, cycles: tuple[set[int], ...]) -> None:
     plan = Plan(faults=(fault,), stop=900)
-    masks: Any = find_injected(plan, Schedule(plan), 900)
-    assert tuple(set(np.flatnonzero(mask).tolist()) for mask in masks) == cycles
+    *masks, labels = find_injected(plan, Schedule(plan), 900)
+    assert labels == (fault.label,) and tuple(set(np.flatnonzero(mask).tolist()) for mask in masks) == cycles
