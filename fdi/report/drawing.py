@@ -184,7 +184,7 @@ def draw_over_time(salt: str, trace: Trace, panels: Sequence[Panel], heights: Se
     # a row lasts one period; one alone is no empty axis
     below = [axes(xlabel=xlabel, xlim=(float(trace.t[0]), float(trace.t[-1]) + trace.period)),
              lambda ax: ax.xaxis.set_label_coords(0.5, -0.3 / heights[-1])]
-    rows = [[[*panel, *common]] for panel in panels]
+    rows = [[[*common, *panel]] for panel in panels]  # the sections lie behind what a panel shades
     rows[-1][0] += below
     return draw_panels(salt, rows, height, width, layout=None, sharex=True, height_ratios=heights, gridspec_kw=place)
 

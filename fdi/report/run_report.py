@@ -315,7 +315,8 @@ def draw_signals(trace: Trace) -> str:
               for number, (values, label, scale, colour) in enumerate(plots)
               if number == 0 or not np.isnan(values).all()]  # the first one has the command
     panels[0] = [line(t, trace.command * d.command.shown_scale, COMMAND, legends[1], 2.4), *panels[0], legend(2),
-                 *(call("annotate", f" {fault}", (t0, 0.07), xycoords=("data", "axes fraction"), fontsize=7)
+                 call("margins", y=0.13),  # room for the names of faults above the lines
+                 *(call("annotate", f" {fault}", (t0, 0.92), xycoords=("data", "axes fraction"), fontsize=7)
                    for fault, t0, _ in faults)]
     checks = trace.sequence_checks
     heights = [1.7] * len(panels) + [0.15 * len(checks) + 0.25] * bool(checks)
