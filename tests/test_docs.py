@@ -87,7 +87,7 @@ def test_the_effects_in_the_manual_work(tmp_path: Path) -> None:
     code = [block for block in indented_blocks(text) if re.match(r"# my_effects\.py|class ", block)]
     assert all(len(block.splitlines()) <= 25 for block in code)
     file = write_file(tmp_path / "my_effects.py", "\n".join(code))
-    assert load_effects(file) == ["seal_drag", "rod_play"]
+    assert load_effects(str(file)) == ["seal_drag", "rod_play"]
     result = rig("effects", "--effects", file, "seal_drag")
     assert result.status == 0 and "seal_drag: exact at its off value" in result.out
     for row in re.findall(r"^    (level = .*)", text, re.MULTILINE):

@@ -193,7 +193,7 @@ def build_base_effect(name: str, *fields: str, law: str, symptoms: str = "", sta
     return Effect(name, "", law, symptoms, meaning, {}, fitted=fields, starts=_name_starts(fields, starts), **more)
 
 
-def load_effects(path: Path, source: bytes | None = None) -> list[str]:
+def load_effects(path: str | Path, source: bytes | None = None) -> list[str]:
     """Run a user's effect file; the names of the effects it registered.
 
     `source` is its content where that has been read already; exactly these bytes run.
@@ -201,7 +201,7 @@ def load_effects(path: Path, source: bytes | None = None) -> list[str]:
     Raises:
         InputError: unreadable, not Python, or it registers nothing.
     """
-    path = path.absolute()  # as the code of its functions will say where it comes from
+    path = Path(path).absolute()  # as the code of its functions will say where it comes from
     require(path.is_file(), path, "", "a Python file with effects; it does not exist")
     run_file(path, read_file(path) if source is None else source)
     new = [name for name, entry in CATALOGUE.list_all().items() if entry.file == path]
