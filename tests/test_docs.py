@@ -188,7 +188,8 @@ EXAMPLES = ROOT / "examples"
 
 def test_the_page_lists_every_program() -> None:
     page = (EXAMPLES / "README.md").read_text()
-    assert [path.name for path in EXAMPLES.glob("*.py") if f"({path.name})" not in page] == []
+    assert [path.name for path in EXAMPLES.glob("*.py") if f"({path.name})" not in page] == [] == (
+        re.findall(r"rig run --bench \S+/bench.toml(?! --controller external --bus udp_multicast:)", page))
 
 
 def test_an_effect_of_ones_own() -> None:

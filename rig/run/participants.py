@@ -53,8 +53,10 @@ def open_participants(job: Job) -> Iterator[tuple[Wire, NodeProcesses]]:
     require(job.controller == "builtin" or not in_firmware, "--controller", job.controller,
             f"a model without effects in the firmware, which only the builtin one has: not {', '.join(in_firmware)}")
     if job.bus.partition(":")[0] in EMBEDDED_NAMES:
-        require(job.controller == "builtin" and job.plant != "external", "--bus", job.bus,
-                "a bus that an external node can be on, such as socketcan:can0")
+        external = " and ".join(name for name in ("controller", "plant") if getattr(job, name) == "external")
+        require(job.controller == "builtin" and not external, "--bus", job.bus,
+                "a bus between programs, such as udp_multicast:239.74.163.5 or socketcan:can0" + (
+                    f", on which you start the {external} of {job.bench.name!r} first" if external else ""))
         makers: list[Callable[[Send], Node]] = (
             [Emulator, partial(Firmware, model=job.model)] if job.bench.has_plant_node else
             [partial(StandIn, bench=job.bench, model=job.model)])

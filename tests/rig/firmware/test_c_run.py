@@ -46,6 +46,8 @@ def test_gains_of_the_model_reach_the_firmware(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("words", "path", "message"), [
     (["--set", "command_rate_limit.rate=0.05"], None, "builtin"),  # effects in the firmware
     *((["--bus", bus], None, "--bus") for bus in ("virtual", "embedded", "slcan:x")),  # no port for it
+    (["--controller", "external", "--bus", "embedded"], None, "on which you start the controller of '"),
+    (["--controller", "external", "--plant", "external", "--bus", "virtual"], None, "the controller and plant of '"),
     (["--bus", "udp_multicast"], "/nowhere", "apt-get install gcc"),
 ])
 def test_what_the_firmware_cannot_do_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str],
