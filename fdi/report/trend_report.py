@@ -59,7 +59,7 @@ def build_trend_report(unit: UnitTrend) -> Report:
             (Column("when"), lambda point: _format_place(point.t, unit)), *map(show_size, g.faults),
             (Column("remark"), lambda point: Cell(point.note, "muted")),
             caption="Fault sizes of each trace with their 95 % intervals.")], medium=Medium.PAGE)]
-    return Report("trend", unit.gathered.source, unit.level.name.replace("_", " "), MOODS[unit.level],
+    return Report("trend", unit.gathered.source, unit.level.name, MOODS[unit.level],
                   f"{count_nouns(len(points), 'trace').capitalize()}, {' to '.join(ends)}. {explain_level(worst)}.",
                   notes=unit.gathered.notes, sections=sections, data=_collect_data(unit))
 
@@ -109,7 +109,7 @@ def _build_fault_section(trend: Trend, unit: UnitTrend) -> Section:
             caption="Probability: that the limit is reached within a time as long as the traces cover.",
             medium=Medium.PAGE)]
     return Section(fault.title, items,
-                   badge=Cell(trend.verdict.replace("_", " "), MOODS[trend.level]), title_medium=Medium.BOTH)
+                   badge=Cell(trend.verdict, MOODS[trend.level]), title_medium=Medium.BOTH)
 
 
 def _describe_arrival(remaining: Remaining, trend: Trend, unit: UnitTrend) -> str:
@@ -196,8 +196,8 @@ def _collect_data(unit: UnitTrend) -> dict[str, Any]:
     Its points can be read back, see `fdi.prognosis.unit_trend.read_points`.
     """
     g = unit.gathered
-    return {"level": {trend.fault.name: trend.level.word for trend in unit.trends}, "axis": g.axis, "unit": unit.unit,
-            "faults": [asdict(fault) for fault in g.faults],
+    return {"verdict": unit.level.name, "level": {trend.fault.name: trend.level.word for trend in unit.trends},
+            "axis": g.axis, "unit": unit.unit, "faults": [asdict(fault) for fault in g.faults],
             "source": g.source, "last": _collect_place(g.points[-1].t, unit), "notes": g.notes,
             "points": [{"trace": p.trace, g.axis: _collect_place(p.t, unit), "t": p.t, "note": p.note,
                         **{f.key: p.sizes[f.name]._asdict() for f in g.faults}} for p in g.points],

@@ -157,11 +157,13 @@ def test_the_command_on_an_earlier_answer(tmp_path: Path) -> None:
     result = rig("trend", source, "--json", "--out", tmp_path / "b.json")
     fss = result.json["trends"]["spool_friction"]
     days = fss["remaining"]["maintenance"]
-    assert result.status == 0 and fss["verdict"] == "TREND" and result.json["last"] == "2026-03-23"
+    assert (result.status, result.json["verdict"], fss["verdict"], result.json["last"]) == (
+        0, "ACCEPTABLE", "TREND", "2026-03-23")
     assert days["low"] <= days["value"] <= days["high"] and days["value_at"] > "2026-03-23"
     assert rig("trend", tmp_path / "b.json", "--json").json["trends"] == result.json["trends"]
     text = rig("trend", source, "--out", tmp_path / "x.html").out
-    assert all(word in text for word in ("spool friction", "TREND", "MaxBand", "per month", "x.html"))
+    assert text.startswith("ACCEPTABLE  ") and all(
+        word in text for word in ("spool friction", "TREND", "MaxBand", "per month", "x.html"))
     bad = points(tmp_path / "c.json", LINE + 25.0)
     assert rig("trend", bad, "--quiet", "--out", tmp_path / "x.png").status == 1  # past MidBand
     page = (tmp_path / "x.html").read_text()
