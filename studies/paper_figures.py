@@ -128,7 +128,7 @@ def _draw_step_in_band(ax: Axes, trace: Trace, e: Excursion, band: StepBand, cen
         beyond = np.where(e.departure > e.middle, x, np.nan)
     ax.plot(t, beyond, color=RED, lw=3.5, alpha=0.5, label="outside")
     size = abs(e.section.last - e.section.first) * 1e3
-    ax.set_ylim(e.section.last * 1e3 - 0.3 * size, e.section.last * 1e3 + 0.3 * size)
+    ax.set_ylim(e.section.last * 1e3 - 0.35 * size, e.section.last * 1e3 + 0.35 * size)
     ax.set_xlabel("time from the step [ms]")
 
 

@@ -436,7 +436,8 @@ def _show_maps(grid: Grid) -> list[Item]:
     first, second = grid.faults
     return [Figure(f"{first.title.capitalize()} and {second.title}: RMS difference between the measured position and "
                    "that of a plant with these two faults alone, for every pair of sizes (logarithmic colours). The "
-                   "minima A (steps) and B (ramps) are merged into G; dashed: the first bisector.",
+                   "minima A (steps) and B (ramps) have the mean G, weighted by where their midpoint lies between "
+                   "the limits of both faults (dashed); C is the minimum of both, the star that of a finer grid.",
                    partial(draw_maps, grid)),
             tabulate(points, (Column("minimum"), lambda point: point[0]),
                      *((Column(fault.symbol, align="right"), lambda point, fault=fault: format_amount(
@@ -668,8 +669,11 @@ def _place_size(fault: Fault, departure: float, way: float) -> float:
     return 2.0 * fault.healthy - fault.place_size(departure) if way < 0.0 else fault.place_size(departure)
 
 
+_BESIDE = "#ffd33d"  # of the hollow markers, in which those of the minima stay visible
+
+
 def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
-    """Figs. 14 and 15: the maps with their minima A and B, the first bisector and the centre of gravity G.
+    """Figs. 14 and 15: the maps with their minima A, B and C, the limits of both faults and the centre of gravity G.
 
     Args:
         grid: from `fdi.diagnosis.rms_grid.search_grid`.
@@ -682,14 +686,14 @@ def draw_maps(grid: Grid, truth: tuple[float, float] | None = None) -> str:
                *([dot(*_scale_sizes(grid, truth), "white", "injected", marker="X", ms=9, mec=INK, mew=0.8)]
                  if truth else [])]
               for name, m, letter in maps if m]
-    panels[-1].append(dot(*_scale_sizes(grid, grid.best.sizes), "#ffd33d", "between cells", marker="*", ms=9, mec=INK))
+    panels[-1].append(dot(*_scale_sizes(grid, grid.best.sizes), "none", "finer grid", marker="*", ms=13, mec=_BESIDE))
     if grid.step and grid.ramp:
         corners = np.array([_scale_sizes(grid, [fault.place_size(x) for fault, x in
                                                 zip(grid.faults, corner, strict=True)])
                             for corner in find_corners(grid.faults)])
         for panel in panels[:2]:
             panel += [line(corners[:, 0], corners[:, 1], "white", width=0.8, ls="--"),
-                      dot(*_scale_sizes(grid, grid.merged.sizes), "#ffd33d", "G", marker="D", ms=5, mec=INK)]
+                      dot(*_scale_sizes(grid, grid.merged.sizes), "none", "G", marker="D", ms=9, mec=_BESIDE)]
     panels[0].append(axes(ylabel=_name_map_axis(grid.faults[1])))
     below = legend(3, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     return draw_panels("maps", [[[*panel, below] for panel in panels]], 3.5, 3.7 * len(panels), sharey=True)
