@@ -400,7 +400,7 @@ LINES = (("detected", "maintenance or worse", BLUE), ("most", "non-nominal", RED
 
 
 def draw_detection_curves(part: Mapping[str, Any], faults: Sequence[Fault] = FAULTS) -> str:
-    """Draw the share of plants that are detected, by size of a single fault, with 95 % intervals, as SVG.
+    """Draw the share of units that are detected, by size of a single fault, with 95 % intervals, as SVG.
 
     `part` is the element of `summarise_campaign(...)["tolerances"]` for one tolerance.
     """
@@ -409,7 +409,7 @@ def draw_detection_curves(part: Mapping[str, Any], faults: Sequence[Fault] = FAU
     panels += [[]] * (-len(panels) % across)
     rows = [panels[i:i + across] for i in range(0, len(panels), across)]
     for row in rows:
-        row[0].append(axes(ylabel="share of plants [%]", ylim=(-3, 103)))
+        row[0].append(axes(ylabel="share of units [%]", ylim=(-3, 103)))
     return draw_panels("detection", rows, 3.6 * len(rows), 10.0, common_legend=True, sharey=True)
 
 
