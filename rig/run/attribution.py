@@ -180,8 +180,8 @@ def find_late_cycles(records: CycleRecords, policy: TimingPolicy, stops: Iterabl
     feedback = ~is_in_time & ~records.injected.plant & ~records.injected.sync
     missing = records.find_missing(PLANT)
     for cycle in stops:
-        known_after = round(0.15 / records.period)  # a change of the NMT state is known with the next heartbeat
-        first = _find_run_start(missing, min(cycle, records.cycles - 1), near=known_after)
+        first = _find_run_start(missing, min(cycle, records.cycles - 1),
+                                near=round(0.15 / records.period))  # s: the next heartbeat shows a changed NMT state
         present = np.flatnonzero(~missing[first:])
         feedback[first:first + int(present[0]) if len(present) else None] = False
     return LateCycles(sync, feedback, records.plant_delay > latest_feedback)
@@ -320,8 +320,8 @@ def find_cause(trouble: Trouble, records: CycleRecords, disturbances: Iterable[D
     silent, origin = _find_silent_node(trouble, records, cycle)
     for node in (silent, trouble.node):
         if node in gone_nodes and records.find_stop(node) <= cycle + 1:  # later it still answered
-            role = Role(node)
-            return _describe_stop(role, bench, records, min(origin, records.find_stop(node)), cycle, gone_nodes[role])
+            return _describe_stop(Role(node), bench, records, min(origin, records.find_stop(node)), cycle,
+                                  gone_nodes[Role(node)])
     if records.injected.fault[max(origin - 1, 0):cycle + 1].any() and trouble.kind != "guard":
         return _describe_injected(records.injected, cycle)
     for disturbance in disturbances:
@@ -391,8 +391,7 @@ def _describe_stop(node: Role, bench: Bench, records: CycleRecords, first: int, 
     if not how and (count or first >= records.cycles):
         text = f"{name} did not answer in time: no {frames} frame for {count_nouns(count, 'cycle')} from {first}"
     else:
-        text = f"{name} stopped answering: no {frames} frame since cycle {first}"
-        text += f"; {how}" if how else ""
+        text = f"{name} stopped answering: no {frames} frame since cycle {first}" + (f"; {how}" if how else "")
     evidence = _show_punctuality(records, first, cycle) if node == CONTROLLER else ()
     return Cause(node, "stopped", first, text, evidence, is_gone=bool(how))
 
@@ -418,8 +417,7 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
         heartbeat_limit: s after which a lost heartbeat has been reported.
         watchdog_limit: cycles after which missing frames have been reported.
     """
-    sync, plant = np.zeros(cycles, dtype=bool), np.zeros(cycles, dtype=bool)
-    number_of_fault = np.zeros(cycles, dtype=np.int64)
+    sync, plant, number_of_fault = (np.zeros(cycles, dtype=kind) for kind in (bool, bool, np.int64))
     silence, cycle_ns = round(heartbeat_limit * plan.rate), round(1e9 / plan.rate)
     for number, fault in enumerate(plan.faults, 1):
         first, last = plan.find_cycles(fault)
@@ -432,9 +430,7 @@ def find_injected(plan: Plan, schedule: Schedule, cycles: int, heartbeat_limit: 
             action = schedule.find_action(frame, k)
             if action.code:
                 last_hit = k - (-action.argument // cycle_ns) if action.code == DELAY else k
-                number_of_fault[k:last_hit + watchdog_limit] = number
+                number_of_fault[k:last_hit + (silence if frame == "sync" else watchdog_limit)] = number
                 plant[k:last_hit + 1] |= frame in ("feedback", "valve_state", "sync")
                 sync[k:last_hit + 1] |= frame == "sync"
-                if frame == "sync":
-                    number_of_fault[k:k + silence] = number
     return Injected(sync, plant, number_of_fault, tuple(fault.label for fault in plan.faults))

@@ -526,10 +526,9 @@ def attribute_run(job: Job, session: Session) -> Attribution:
     if not job.realtime:  # nothing is late in lockstep; frames are there or missing
         times = [np.where(np.isnan(values), values, 0.0) for values in times]
     lateness, feedback, valve, response = times
-    plan = job.scenario.plan
-    injected = find_injected(plan, session.faults, len(history))
     records = CycleRecords(np.array(session.log.due_ns, dtype=np.int64), lateness, feedback, valve, response,
-                           history.column("flags").astype(np.int64), injected,
+                           history.column("flags").astype(np.int64),
+                           find_injected(job.scenario.plan, session.faults, len(history)),
                            select_plant_delays(session.plant_record, len(history)), job.period_ns / 1e9)
     return attribute(records, session.safety.troubles, job.sequence.timing, job.bench, session.nodes.gone)
 
