@@ -380,6 +380,7 @@ class Trend:
     remaining: Mapping[str, Remaining]  # by the level that begins there; {} if too few
     past: Curve | None
     future: Curve | None
+    no_growth: float = 1.0  # probability that the size does not grow now
     declared: Fault | None = None  # of a fault that falls, which the trend follows by its distance from a healthy unit
 
     @property
@@ -419,9 +420,10 @@ def fit_trend(fault: Fault, times: Sequence[float], estimates: Sequence[Estimate
     level = fault.healthy + unit * estimate_level(series.data, posterior, middle)
     past = Curve(t[series.first] + span * middle, *level)
     now = np.maximum(fault.healthy + unit * paths.sizes[:, 0], fault.range[0])
-    return Trend(fault, "TREND" if laws["none"] < NO_GROWTH_PROBABILITY else "NO_TREND", t, sizes, is_used, breaks,
+    no_growth = float((paths.rate <= 0.0).mean())  # a wander that falls now is none either
+    return Trend(fault, "TREND" if no_growth < NO_GROWTH_PROBABILITY else "NO_TREND", t, sizes, is_used, breaks,
                  laws, _summarise_draws(now), _summarise_draws(paths.rate * unit / span), remaining, past,
-                 _make_forecast(fault, unit, paths, float(t[-1]), span))
+                 _make_forecast(fault, unit, paths, float(t[-1]), span), no_growth)
 
 
 def _scale_series(fault: Fault, t: Floats, sizes: Sequence[Estimate]) -> tuple[Scaled, float]:

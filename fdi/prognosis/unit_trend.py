@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,7 +112,8 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
         faults: what to follow.
 
     Raises:
-        InputError: no folder, no traces, no axis on which all of them have a place, or none that can be judged.
+        InputError: no folder, no traces, no axis on which all of them have a place, hours or flights that fall while
+            the date rises, or none that can be judged.
     """
     place = table or folder / TABLE
     dates = read_dates_table(place) if table or place.is_file() else {}
@@ -127,7 +129,8 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
     matches = [find_row(dates, name) for name in names.values()]
     notes += [f"{key} is listed in {place.name}, but there is no such trace" for key, row in dates.items()
               if not any(row is match for match in matches)]  # two traces may have equal rows
-    points = []
+    _check_counter(rows, axis)
+    points: dict[tuple[float | Estimate, ...], Point] = {}
     for i, (file, row) in enumerate(rows.items()):
         progress(f"trace {i + 1} of {len(rows)}", i / len(rows))
         try:
@@ -136,11 +139,15 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
             notes.append(f"{names[file]} left out: {str(error).removeprefix(f'{file}: ')}")
             continue
         sizes = {f.name: Estimate(*answer["sizes"][f.name]) for f in faults}
-        points.append(Point(names[file], row[axis], sizes, answer["note"]))
+        point = Point(names[file], row[axis], sizes, answer["note"])
+        same = points.setdefault((point.t, *sizes.values()), point)
+        if same is not point:  # noise never repeats a size to the last digit
+            notes.append(f"{point.trace} left out: it is a copy of {same.trace}, with the same sizes at the same time")
     progress("trend", 1.0)
     if not points:
         raise InputError(folder, "", f"traces that can be judged; {notes[0]}" + (" ..." if notes[1:] else ""))
-    return Gathered(str(folder), axis, tuple(sorted(points, key=lambda p: (p.t, p.trace))), tuple(notes), tuple(faults))
+    in_order = tuple(sorted(points.values(), key=lambda p: (p.t, p.trace)))
+    return Gathered(str(folder), axis, in_order, tuple(notes), tuple(faults))
 
 
 def list_traces(folder: Path) -> list[Path]:
@@ -176,6 +183,14 @@ def _choose_axis(folder: Path, rows: Mapping[Path, Row], choice: str | None) -> 
         "a start time in the log, an ISO date in the name of file or folder (2026-01-31), or a line in "
         f"{folder / TABLE} (file,date)")
     raise InputError(without[missing][0], missing, expected)
+
+
+def _check_counter(rows: Mapping[Path, Row], axis: str) -> None:
+    """Refuse hours or flights that fall while the date rises: a unit's counter does not."""
+    dated = sorted((row["date"], row[axis], str(file)) for file, row in rows.items() if not math.isnan(row["date"]))
+    for (_, least, earlier), (_, count, file) in pairwise(dated):
+        require(count >= least, file, axis, f"at least the {least:g} of {earlier}, which has an earlier date, "
+                                            f"not {count:g}")
 
 
 def read_start_time(file: Path, model: Model, again: bool = False, faults: Sequence[Fault] = FAULTS) -> str:
@@ -299,8 +314,8 @@ def _read_cell(where: str, axis: str, text: str) -> float:
         value = parse_date(text) if axis == "date" else float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        kind = "an ISO date such as 2026-01-31" if axis == "date" else "a number"
+    if not math.isfinite(value) or (axis != "date" and value < 0.0):
+        kind = "an ISO date such as 2026-01-31" if axis == "date" else "a number from 0"
         raise InputError(where, axis, f"{kind}, not {text}")
     return value
 

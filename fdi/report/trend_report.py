@@ -141,7 +141,7 @@ def _describe_growth(trend: Trend, unit: UnitTrend) -> str:
         reason = reasons.get(int(trend.used.sum()), "all traces have the same date")
         return f"{state}; no trend: {reason}; at least {TREND_FEWEST_TRACES} traces of different dates are needed"
     if trend.verdict == "NO_TREND" or trend.rate is None:
-        return f"{state}; no trend: the probability that nothing grows is {100 * trend.laws['none']:.0f} %"
+        return f"{state}; no trend: the probability that nothing grows is {100 * trend.no_growth:.0f} %"
     period, length = {"days": ("month", 30.44), "h": ("100 h", 100.0), "flights": ("100 flights", 100.0)}[unit.unit]
     return (f"{state}; {'falls' if fault.falls else 'grows'} by "
             f"{format_interval(*Estimate(*(length * x for x in trend.rate)), fault.unit)} per {period}")

@@ -55,7 +55,8 @@ def test_a_table_of_dates(tmp_path: Path) -> None:
     assert find_row(rows, "sub/a.csv") == row
     assert find_row(rows, "b.csv") is None
     for text, field in (("name,date\n", "header"), ("", "header"), ("file,date\na.csv,soon\n", "date"),
-                        ("file,hours\na.csv,x\n", "hours"), ("file,date\na,2026-01-01\na,2026-01-02\n", "file")):
+                        ("file,hours\na.csv,x\n", "hours"), ("file,flights\na.csv,-1\n", "flights"),
+                        ("file,date\na,2026-01-01\na,2026-01-02\n", "file")):
         table.write_text(text)
         assert f": {field}: " in catch_refusal(read_dates_table, table)
 
@@ -76,8 +77,9 @@ def test_the_law_is_recognised_and_the_time_left_found(law: str) -> None:
 
 
 def test_what_does_not_grow_has_no_trend_and_what_is_past_a_limit_no_time_left() -> None:
-    still, grown = friction([5.0] * 14), friction(np.linspace(20.0, 45.0, 10))
-    assert (still.verdict, still.remaining["non_nominal"].high) == ("NO_TREND", math.inf) and still.laws["none"] > 0.5
+    still, hump, grown = map(friction, ([5.0] * 14, 5.0 + 20.0 * np.sin(WEEKS / 29.0), np.linspace(20.0, 45.0, 10)))
+    assert {still.verdict, hump.verdict} == {"NO_TREND"} and still.remaining["non_nominal"].high == math.inf
+    assert hump.laws["none"] < 0.05 < 0.5 < min(still.laws["none"], hump.no_growth)  # it grew, and falls now
     assert grown.level.word == "maintenance"
     assert grown.remaining["maintenance"].high == 0.0 < grown.remaining["non_nominal"].low
 
@@ -182,7 +184,7 @@ def answered(file: Path, model: Any, again: bool = False, faults: Any = ()) -> d
 def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "unit"
     (folder / "2026-02-01").mkdir(parents=True)
-    for name in ("own.mcap", "2026-02-01/named.csv", "table.csv", "broken.csv"):
+    for name in ("own.mcap", "2026-02-01/named.csv", "table.csv", "table_copy.csv", "broken.csv"):
         (folder / name).write_text("")
     monkeypatch.setattr(unit_trend, "diagnose_once", answered)
     monkeypatch.setattr(unit_trend, "read_start_time", lambda *a: answered(*a)["started"])
@@ -190,16 +192,19 @@ def test_where_dates_come_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     def gathered(axis: str | None = None) -> unit_trend.Gathered:
         return unit_trend.gather_sizes(folder, load_model(), ignore_progress, axis)
 
-    assert re.search(r"table.csv: date: expected .*dates.csv", catch_refusal(gathered))
-    (folder / "dates.csv").write_text("file,date,hours\ntable.csv,2026-01-20,30\nown.mcap,,10\n"
-                                      "named.csv,,20\nold.csv,2026-01-20,30\nbroken.csv,2026-01-20,30\n")
+    assert (re.search(r"table.csv: date: expected .*dates.csv", catch_refusal(gathered))
+            and "with a column flights" in catch_refusal(gathered, "flights"))
+    (folder / "dates.csv").write_text(
+        "file,date,hours,flights\ntable.csv,2026-01-20,20,2\ntable_copy.csv,2026-01-20,20,2\nown.mcap,,10,3\n"
+        "named.csv,,30,4\nold.csv,2026-01-20,20,2\nbroken.csv,2026-01-20,20,2\n")
     trace_sizes = gathered()
     assert [p.trace for p in trace_sizes.points] == ["own.mcap", "table.csv", "2026-02-01/named.csv"]
     assert [format_day(p.t) for p in trace_sizes.points] == ["2026-01-10", "2026-01-20", "2026-02-01"]
     assert [note.split(",")[0] for note in trace_sizes.notes] == ["broken.csv left out: xj: expected a position",
-                                                                  "old.csv is listed in dates.csv"]
+                                                                  "old.csv is listed in dates.csv",
+                                                                  "table_copy.csv left out: it is a copy of table.csv"]
     assert [p.t for p in gathered("hours").points] == [10.0, 20.0, 30.0]
-    assert "flights" in catch_refusal(gathered, "flights")
+    assert re.search("table.csv: flights: expected at least the 3 of .*own.mcap", catch_refusal(gathered, "flights"))
 
 
 def test_a_trace_is_diagnosed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
