@@ -15,10 +15,10 @@ def require_writable(out: str | Path, option: str, *, source: str | Path | None 
     Folders are not made. Raises InputError for a place that cannot be written, and for the `source` itself.
     """
     path = Path(out)
-    is_present = path.exists()
-    if is_present and source is not None and Path(source).exists() and path.samefile(source):
-        raise InputError(option, str(path), "another file than the one that is read")
     with report_system_error(option, str(path), "a place that can be written"):
+        is_present = path.exists()
+        if is_present and source is not None and Path(source).exists() and path.samefile(source):
+            raise InputError(option, str(path), "another file than the one that is read")
         path.open("ab").close()
     if not is_present:
         path.unlink()
@@ -65,13 +65,15 @@ def write_whole(path: str | Path) -> Iterator[Path]:
     if not can_be_replaced or not os.access(place.parent, os.W_OK):
         yield place
         return
-    part = place.with_name(f".part-{os.getpid()}-{place.name}")  # the suffix stays: it chooses the format
+    part = place.with_name(f".part-{os.getpid()}-{place.name[-50:]}")  # the suffix stays: it chooses the format
     try:
         yield part
         if place.exists():
             part.chmod(place.stat().st_mode & 0o7777)
         part.replace(place)
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, OSError) and error.filename in (None, str(part)):
+            error.filename = str(path)  # a full disk names none, and no one knows the part
         if part.is_dir():
             shutil.rmtree(part)
         part.unlink(missing_ok=True)

@@ -32,6 +32,8 @@ rig tests the controller of an electrohydraulic actuator and analyses its record
 rig --help lists all commands, rig COMMAND --help the options of one."""
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h
 INTERRUPTED = 130
+# What the system has against a name or place that the user chose; anything else may be a bug.
+REFUSALS = {errno.ENAMETOOLONG, errno.ELOOP, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -160,9 +162,10 @@ def run_command_line(words: Sequence[str]) -> int:
         discard_output()
         return status
     except Exception as error:
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        if isinstance(error, OSError) and error.errno in REFUSALS:
             discard_output()
-            return _report_error(name, f"no space left for the output or the results ({error.strerror})", 2)
+            return _report_error(name, f"{error.filename or 'the output or the results'}: expected a file that the "
+                                       f"system accepts ({error.strerror})", 2)
         from traceback import print_exc
 
         from plant import find_compile_error

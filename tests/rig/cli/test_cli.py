@@ -173,7 +173,8 @@ def test_an_odd_terminal_and_odd_names_end_no_command(name: str, here: Path) -> 
     result = finished(started("simulate", "--command", "ü.csv", "--out", "ä.csv", env={
         **os.environ, name: {"COLUMNS": "0"}.get(name, "ascii")}))
     assert (result.status, result.err, "csv" in result.out) == (0, "", True)
-    assert "names of files in UTF-8" in refuse("simulate", "--command", "\udcfc.csv")
+    assert "names of files in UTF-8" in refuse("simulate", "--command", "\udcfc.csv") and (
+        "accepts (File name too long)" in refuse("fdi", "x" * 300))
 
 
 def test_the_installed_command_is_this_one() -> None:

@@ -58,14 +58,15 @@ def _refused(words: list[str], sources: dict[str, Path], out: Path) -> str:
     return line
 
 
-@pytest.mark.parametrize("place", ["proc", "no folder", "a file as folder", "a folder"])
+@pytest.mark.parametrize("place", ["proc", "no folder", "a file as folder", "a folder", "a long name"])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_impossible_places(sources: dict[str, Path], tmp_path: Path, command: str, place: str) -> None:
     words, suffix = COMMANDS[command]
     (tmp_path / "file").write_text("precious")
     (tmp_path / f"folder{suffix}").mkdir()
     out = {"proc": Path(f"/proc/x{suffix}"), "no folder": tmp_path / "none" / f"x{suffix}",
-           "a file as folder": tmp_path / "file" / f"x{suffix}", "a folder": tmp_path / f"folder{suffix}"}[place]
+           "a file as folder": tmp_path / "file" / f"x{suffix}", "a folder": tmp_path / f"folder{suffix}",
+           "a long name": tmp_path / f"{'x' * 300}{suffix}"}[place]
     error = _refused(words, sources, out)
     assert "expected a place that can be written" in error and str(out.with_suffix("")) in error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", f"folder{suffix}"]
@@ -104,7 +105,7 @@ def test_a_full_disk_leaves_what_was_there_and_no_part(tmp_path: Path, name: str
             (out / file).write_bytes(content)
         result = subprocess.run([sys.executable, "-B", "-m", "rig.cli.main", *words], capture_output=True, text=True,
                                 preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (SMALLEST, SMALLEST)))
-        assert (result.returncode, result.stderr.count("\n")) == (2, 1), result
+        assert (result.returncode, result.stderr.count("\n"), name in result.stderr) == (2, 1, True), result
         assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
@@ -121,7 +122,7 @@ def test_simulate_export_and_recover_do_not_replace_a_file_unasked(sources: dict
 
 
 def test_a_failure_in_the_middle_leaves_the_file_before(tmp_path: Path) -> None:
-    place = tmp_path / "a.txt"
+    place = tmp_path / f"{'a' * 251}.txt"  # the longest name that a file may have
     write_text(place, "before")
     place.chmod(0o640)
     with pytest.raises(ZeroDivisionError), write_whole(place) as part, write_whole(tmp_path / "folder") as folder:
