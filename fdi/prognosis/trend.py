@@ -88,8 +88,7 @@ def find_first_passage(paths: Paths, limit: float) -> Floats:
     before = np.maximum(first - 1, 0)
     low, high = paths.sizes[rows, before], paths.sizes[rows, first]
     share = np.where(first > 0, (limit - low) / np.where(high > low, high - low, 1.0), 0.0)
-    when: Floats = AHEAD[before] + share * (AHEAD[first] - AHEAD[before])
-    return np.where(above.any(axis=1), when, np.inf)
+    return np.asarray(np.where(above.any(axis=1), AHEAD[before] + share * (AHEAD[first] - AHEAD[before]), np.inf))
 
 
 def _sample_stratified_rows(weights: Floats, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -169,8 +168,7 @@ class Posterior(NamedTuple):
     def weights(self) -> Floats:
         """Probability of each part and shape, (parts, k)."""
         evidence = np.array([part.evidence for part in self.parts])
-        weights: Floats = np.exp(evidence - np.logaddexp.reduce(evidence, axis=None))
-        return weights
+        return np.asarray(np.exp(evidence - np.logaddexp.reduce(evidence, axis=None)))
 
     def compute_law_probabilities(self) -> dict[str, float]:
         """Probability of each law."""
@@ -242,8 +240,8 @@ def _fit_part(data: Scaled, g: Floats, noise: int, wander: int) -> Part:
 
 def compute_rise_evidence(rise: Floats, deviation: Floats, usual: Floats) -> Floats:
     """Log evidence that a rise >= 0 with a half-normal prior adds, from its mean and deviation before truncation."""
-    out: Floats = (0.5 * (rise / deviation) ** 2 + np.log(deviation / usual) + np.log(2.0) + log_ndtr(rise / deviation))
-    return out
+    return np.asarray(0.5 * (rise / deviation) ** 2 + np.log(deviation / usual) + np.log(2.0)
+                      + log_ndtr(rise / deviation))
 
 
 def _compute_end_covariance(data: Scaled, wander: int) -> Floats:
@@ -442,9 +440,7 @@ def _fit_unit_error(data: Scaled, is_used: Flags) -> Floats:
     A line through the intervals' deviations over the sizes; the last deviation where the sizes hardly differ.
     """
     y, sigma = data.y[is_used], data.sigma[is_used]
-    if np.ptp(y) < INTERVAL_SLOPE_RANGE:
-        return sigma[-1:]
-    return np.polyfit(y, sigma, 1)
+    return sigma[-1:] if np.ptp(y) < INTERVAL_SLOPE_RANGE else np.polyfit(y, sigma, 1)
 
 
 def _sample_paths(series: Cleaned, posterior: Posterior, unit_error: Floats) -> Paths:

@@ -47,9 +47,9 @@ class UnitTrend:
 
 def follow_unit(gathered: Gathered) -> UnitTrend:
     """Follow the faults through the traces; one that falls, or goes both ways, by its distance from a healthy unit."""
-    t = [point.t for point in gathered.points]
-    trends = (fit_trend(fault.turn_up(), t, [measure_departures(fault, point.sizes[fault.name])
-                                             for point in gathered.points]) for fault in gathered.faults)
+    trends = (fit_trend(fault.turn_up(), [point.t for point in gathered.points],
+                        [measure_departures(fault, point.sizes[fault.name]) for point in gathered.points])
+              for fault in gathered.faults)
     return UnitTrend(gathered, tuple(replace(trend, declared=fault if fault.falls else None)
                                      for trend, fault in zip(trends, gathered.faults, strict=True)))
 
@@ -62,8 +62,7 @@ def read_points(path: Path, faults: Sequence[Fault] | None = None) -> Gathered:
     """
     try:
         answer = json.loads(path.read_text(encoding="utf-8"))
-        stored_faults = tuple(Fault(**table) for table in answer.get("faults", ()))
-        faults = tuple(faults or stored_faults or FAULTS)
+        faults = tuple(faults or (Fault(**table) for table in answer.get("faults", ()))) or FAULTS
         points = tuple(Point(str(p["trace"]), float(p["t"]), {
             f.name: Estimate(*(float(p[f.key][name]) for name in Estimate._fields)) for f in faults},
             str(p.get("note", ""))) for p in answer["points"])
@@ -129,7 +128,6 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
     matches = [find_row(dates, name) for name in names.values()]
     notes += [f"{key} is listed in {place.name}, but there is no such trace" for key, row in dates.items()
               if not any(row is match for match in matches)]  # two traces may have equal rows
-    _check_counter(rows, axis)
     points: dict[tuple[float | Estimate, ...], Point] = {}
     for i, (file, row) in enumerate(rows.items()):
         progress(f"trace {i + 1} of {len(rows)}", i / len(rows))
@@ -139,15 +137,14 @@ def gather_sizes(folder: Path, model: Model, progress: Progress, axis: str | Non
             notes.append(f"{names[file]} left out: {str(error).removeprefix(f'{file}: ')}")
             continue
         sizes = {f.name: Estimate(*answer["sizes"][f.name]) for f in faults}
-        point = Point(names[file], row[axis], sizes, answer["note"])
-        same = points.setdefault((point.t, *sizes.values()), point)
-        if same is not point:  # noise never repeats a size to the last digit
-            notes.append(f"{point.trace} left out: it is a copy of {same.trace}, with the same sizes at the same time")
+        first = points.setdefault((row[axis], *sizes.values()), Point(names[file], row[axis], sizes, answer["note"]))
+        if first.trace != names[file]:  # noise never repeats a size to the last digit
+            notes.append(f"{names[file]} left out: it is a copy of {first.trace}, with the same sizes at the same time")
     progress("trend", 1.0)
     if not points:
         raise InputError(folder, "", f"traces that can be judged; {notes[0]}" + (" ..." if notes[1:] else ""))
-    in_order = tuple(sorted(points.values(), key=lambda p: (p.t, p.trace)))
-    return Gathered(str(folder), axis, in_order, tuple(notes), tuple(faults))
+    return Gathered(str(folder), axis, tuple(sorted(points.values(), key=lambda p: (p.t, p.trace))), tuple(notes),
+                    tuple(faults))
 
 
 def list_traces(folder: Path) -> list[Path]:
@@ -173,24 +170,20 @@ def _date_trace(folder: Path, name: str, start_time: str, row: Row | None) -> Ro
 
 
 def _choose_axis(folder: Path, rows: Mapping[Path, Row], choice: str | None) -> str:
-    """The axis asked for, or the first on which every trace has a place."""
+    """The axis asked for, or the first on which every trace has a place; hours or flights rise with the date."""
     without = {axis: [file for file, row in rows.items() if math.isnan(row[axis])] for axis in AXES}
     for axis in (choice,) if choice else AXES:
         if not without[axis]:
+            dated = sorted((row["date"], row[axis], file) for file, row in rows.items() if not math.isnan(row["date"]))
+            for (_, least, earlier), (_, count, file) in pairwise(dated):
+                require(count >= least, file, axis,
+                        f"at least the {least:g} of {earlier}, which has an earlier date, not {count:g}")
             return axis
     missing = choice or "date"
     expected = f"a line in {folder / TABLE} with a column {missing}" if missing != "date" else (
         "a start time in the log, an ISO date in the name of file or folder (2026-01-31), or a line in "
         f"{folder / TABLE} (file,date)")
     raise InputError(without[missing][0], missing, expected)
-
-
-def _check_counter(rows: Mapping[Path, Row], axis: str) -> None:
-    """Refuse hours or flights that fall while the date rises: a unit's counter does not."""
-    dated = sorted((row["date"], row[axis], str(file)) for file, row in rows.items() if not math.isnan(row["date"]))
-    for (_, least, earlier), (_, count, file) in pairwise(dated):
-        require(count >= least, file, axis, f"at least the {least:g} of {earlier}, which has an earlier date, "
-                                            f"not {count:g}")
 
 
 def read_start_time(file: Path, model: Model, again: bool = False, faults: Sequence[Fault] = FAULTS) -> str:
@@ -314,9 +307,8 @@ def _read_cell(where: str, axis: str, text: str) -> float:
         value = parse_date(text) if axis == "date" else float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or (axis != "date" and value < 0.0):
-        kind = "an ISO date such as 2026-01-31" if axis == "date" else "a number from 0"
-        raise InputError(where, axis, f"{kind}, not {text}")
+    kind, least = ("an ISO date such as 2026-01-31", -math.inf) if axis == "date" else ("a number from 0", 0.0)
+    require(math.isfinite(value) and value >= least, where, axis, f"{kind}, not {text}")
     return value
 
 

@@ -167,7 +167,7 @@ def _describe_time_left(remaining: Remaining, trend: Trend, unit: UnitTrend) -> 
         return "reached"
     if remaining.low == math.inf:
         return "not foreseeable"
-    low, value, high = (f"{t:.2g} {unit.unit}" if t < 10 else f"{t:.0f} {unit.unit}"
+    low, value, high = (_format_time(t, ".2g" if t < 10 else ".0f", unit.unit)
                         for t in (remaining.low, remaining.value, remaining.high))
     if trend.verdict != "TREND" or remaining.value == math.inf:
         return "may be reached already" if remaining.low == 0.0 else f"not before {low} (97.5 %)"
@@ -179,13 +179,23 @@ def _format_date(t: float, unit: UnitTrend) -> str:
     if not math.isfinite(t):
         return "never"
     at = unit.gathered.points[-1].t + t
-    return _format_place(at, unit) if unit.gathered.axis == "date" else f"{at:.0f} {unit.unit}"
+    return _format_place(at, unit) if unit.gathered.axis == "date" else _format_time(at, ".0f", unit.unit)
+
+
+def _format_time(t: float, digits: str, unit: str) -> str:
+    """A time with its unit.
+
+    >>> _format_time(1.0, "g", "flights"), _format_time(2.0, "g", "flights"), _format_time(1.0, "g", "h")
+    ('1 flight', '2 flights', '1 h')
+    """
+    number = format(t, digits)
+    return f"{number} {unit.removesuffix('s') if number == '1' else unit}"
 
 
 def _format_place(t: float, unit: UnitTrend) -> str:
     """A date, with the time where the traces cover less than two days, or hours or flights; `t` is on their axis."""
     if unit.gathered.axis != "date":
-        return f"{t:g} {unit.unit}"
+        return _format_time(t, "g", unit.unit)
     points = unit.gathered.points
     return format_day(t, with_time=points[-1].t - points[0].t < 2.0)
 
