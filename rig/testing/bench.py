@@ -5,6 +5,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,7 @@ class Bench:
         __tracebackhide__ = True  # pytest shows the line of the test
         folder = self.folder / f"run-{len(self.runs) + 1}"
         try:
+            require(set is None or isinstance(set, Mapping), "set", "", 'values by parameter: {"filter.clogging": 0.5}')
             model_name = self.model if model is None else str(model)
             choice = JobChoice("", model_name, set or {}, seed, tuple(map(Path, effects)), str(bench))
             tested, plant = load_tested_plant(choice)
@@ -191,7 +193,7 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
     """
     additions = {key: list(entries) for key, entries in more.items() if len(entries)}
     if command is None:
-        base = load_sequence(sequence or "preflight", rate, plant)
+        base = load_sequence("preflight" if sequence is None else sequence, rate, plant)
         if not additions:
             return base
         table, files, name = tomllib.loads(base.source), dict(base.files), base.name
@@ -210,9 +212,11 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
 
 def _make_table(command: Command, rate: float, column: str) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The table of a sequence that plays a command, and its files."""
-    main: Any = list(np.atleast_1d(command) if isinstance(command, np.ndarray) else command)
+    main: Any = list(command) if isinstance(command, Sequence) or np.ndim(command) == 1 else [None]
     files = {}
     if not any(isinstance(part, Mapping) for part in main):
+        require(all(isinstance(value, Real) for value in main), "command", "",
+                "a demand in m for each cycle, all of them real numbers, or a list of segments as tables")
         rows = "\n".join(f"{k / rate!r},{float(value)!r}" for k, value in enumerate(main))
         main = [{"name": "command", "kind": "csv", "file": _COMMAND_FILE}]
         files[_COMMAND_FILE] = f"t,{column}\n{rows}\n".encode()

@@ -113,10 +113,13 @@ def test_text_of_a_table_is_the_same_table() -> None:
     ({"sequence": None, "command": STEP, "checks": [{"name": "x", "kind": "overshot"}]}, "did you mean 'overshoot'"),
     ({"sequence": None, "command": np.zeros(0)}, "command.csv"),
     ({"sequence": None, "command": np.array([0.0, np.nan])}, "a finite number"),
-    ({"sequence": None, "command": [{"kind": "hold", "time": object()}]}, "not object"),
+    ({"sequence": None, "command": [{"kind": "hold", "time": object()}]}, "not object"), ({"sequence": ""}, ".toml"),
+    *(({"command": command}, "command: expected a demand in m for each cycle, all of them real numbers")
+      for command in (5, "abc", np.zeros((3, 3)), np.zeros(100) + 1j, np.array(0.0), [1e-3, None])),
+    ({"command": STEP, "set": [1]}, "set: expected values by parameter"),
 ])
-def test_what_cannot_be_used_says_so(arguments: dict[str, object], line: str) -> None:
-    assert line in catch_refusal(build_sequence, **arguments)
+def test_what_cannot_be_used_says_so(arguments: dict[str, object], line: str, tmp_path: Path) -> None:
+    assert line in catch_refusal(Bench(tmp_path).run, **arguments)
 
 
 def test_loading_the_plugin_costs_next_to_nothing() -> None:
