@@ -251,6 +251,7 @@ def parse_faults(words: Sequence[str]) -> list[dict[str, Any]]:
         block = {}
         for part in word.split("/") if word != HEALTHY else []:
             name, _, values = part.partition("=")
+            require(name.strip() not in block, "--fault", word, f"one size for {name.strip()}, not two")
             try:
                 block[name.strip()] = [float(value) for value in values.split(",")]
             except ValueError:
