@@ -188,6 +188,7 @@ def place_fault(fault: Fault, kind: Any, where: object = "faults") -> Fault:
     unseen = {"controller", "sensors", *(e.name for e in effects if e.port in ("command", "reading"))}
     check(fault.parameter.partition(".")[0] not in unseen, "parameter",
           f"a parameter that a replay of the measured drive shows; {fault.parameter} is none")
+    check(not q.words, "parameter", f"a parameter that has sizes; {fault.parameter} has named choices")
     check(q.unit, "parameter", f"a parameter with a unit; {fault.parameter} is declared without one")
     check(fault.unit in ("", q.unit), "unit", f"{q.unit}, that of {fault.parameter}, not {fault.unit}")
     values = {**{name: off for e in effects for name, off in e.off.items()}, **kind.nominal}

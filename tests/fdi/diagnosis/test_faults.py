@@ -96,6 +96,7 @@ def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
     ({"follow": {"jack.mass": -1.0}}, ["follow", "values of jack.mass", "not -1"]),
     ({"axis": [1e-4, 0.0]}, ["axis", "within the range"]), ({"axis": [0.0, 1e-3]}, ["axis", "within the range"]),
     ({"parameter": "controller.current_limit"}, ["parameter", "a replay of the measured drive shows"]),
+    ({"parameter": "filter.law"}, ["parameter", "filter.law has named choices"]),
     ({"parameter": "quantisation.lsb"}, ["parameter", "a replay of the measured drive shows"]),
     ({"both_ways": 1}, ["both_ways", "true or false"])])
 def test_a_bad_fault_is_one_line_with_status_2(tmp_path: Path, keys: dict[str, Any], words: list[str]) -> None:
