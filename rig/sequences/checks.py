@@ -582,7 +582,8 @@ KINDS: dict[str, Kind] = {
                          lambda check, run, span: abs(float(run.read_signal("error", span).mean()))),
     "ramp_error": Kind("Mean lag behind a ramp, m.", "m", lambda check, run, span: measure_ramp_error(
         run.read_signal("error", span), run.read_signal(run.signals.command.name, span))),
-    "break_away": Kind("Position error before the spool lets go on a slow ramp, m; median over 5 ms.", "m",
+    "break_away": Kind("Position error before the spool lets go on a slow ramp: half of its span from the 1st to the "
+                       "99th percentile, m; median over 5 ms.", "m",
                        lambda check, run, span: measure_break_away(run.read_signal("error", span), run.rate)),
     "max_error": Kind("Largest position error in either direction, m; median over 5 ms.", "m",
                       lambda check, run, span: float(np.abs(filter_median(run.read_signal("error", span), run.rate)
