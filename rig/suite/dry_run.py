@@ -105,7 +105,7 @@ class DryRun(NamedTuple):
     faults: list[PlannedFault]  # that the run will inject
     predicted: Trace  # of setup, main and cleanup, without the faults; its events say when they act
     limits: tuple[LimitReached, ...]  # that the predicted run reaches
-    checks: list[CheckResult]  # on the predicted run, those that need no events
+    checks: list[CheckResult]  # on the predicted run, those that need neither events nor faults
     not_predicted: list[str]  # the other checks
     trips: list[tuple[str, float]]  # guards that the predicted run violates, and when, s of main
 
@@ -145,16 +145,18 @@ def make_dry_run(job: Job) -> DryRun:
     columns = make_columns_type(signals)(np.arange(last - first) / rate,
                                          *(column[first:last] for column in prediction[1:]))
     run = RunData(columns, sequence.sections(), starts=sequence.fault_starts(), rate=rate, signals=signals)
-    checks = [check.judge(run) for check in sequence.checks if check.kind not in OF_EVENTS]
-    events = [Event(at, "INFO", "fault", f"{fault.name} {word}") for fault in faults
-              for at, word in ((fault.t0, "begins"), (fault.t1, "ends"))]
+    not_predicted = [check.name for check in sequence.checks if check.kind in OF_EVENTS
+                     and (sequence.faults or not getattr(check, "signal", None))]
+    checks = [check.judge(run) for check in sequence.checks if check.name not in not_predicted]
     trace = replace(Trace.from_columns(prediction._asdict(), 1 / rate, {}, signals), t=t, checks=tuple(checks),
-                    phase=np.searchsorted((first, last), np.arange(len(t)), side="right"), events=tuple(events))
+                    phase=np.searchsorted((first, last), np.arange(len(t)), side="right"), events=tuple(
+                        Event(at, "INFO", "fault", f"{fault.name} {word}") for fault in faults
+                        for at, word in ((fault.t0, "begins"), (fault.t1, "ends"))))
     return DryRun(
         job=job, durations={phase: len(profile.command) / rate for phase, profile in phases.items()},
         demands=measure_demands(command, load, t, name_rows(phases), model, rate), faults=faults, predicted=trace,
         limits=find_limits(lambda name: getattr(prediction, name), model, job.bench, first), checks=checks,
-        not_predicted=[check.name for check in sequence.checks if check.kind in OF_EVENTS],
+        not_predicted=not_predicted,
         trips=[] if sequence.faults else [*find_trips(sequence.guards, run)])
 
 
@@ -317,7 +319,7 @@ def build_dry_run_report(dry: DryRun, files: Sequence[tuple[str, str]] = ()) -> 
 
 def _list_notes(dry: DryRun) -> list[str]:
     length, half_a_cycle = dry.durations["main"], 0.5 / dry.job.sequence.rate
-    lists = {"not predicted, because they judge events": dry.not_predicted,
+    lists = {"not predicted, because they judge events or what a fault causes": dry.not_predicted,
              "these checks would fail on the predicted run": [
                  check.name for check in dry.checks if not check.passed and check.value == check.value]}
     return [*(["the prediction is without the faults of the sequence"] if dry.job.sequence.faults else []),

@@ -344,7 +344,8 @@ main = [
   { name = "end", kind = "hold", time = 0.1 },
 ]
 load = [{ kind = "ramp", to = 4e4, time = 0.2 }]
-checks = [{ name = "steps", kind = "settling_time", window = [0.0, 0.1], band = 2.0, high = 1.0 }]
+checks = [{ name = "steps", kind = "settling_time", window = [0.0, 0.1], band = 2.0, high = 1.0 },
+          { name = "never", kind = "response_within", after = 0.0, signal = "xj", above = 2.0, high = 1.0 }]
 guards = [{ name = "far out", signal = "xj", high = 20.0, unit = "mm" }]
 """
 
@@ -375,7 +376,8 @@ def test_what_is_beyond_the_limits(tmp_path: Path) -> None:
     assert result.status == 1 and [words for words in (
         "BEYOND_LIMITS position 50 mm beyond 40 mm (jack.travel) in 'end', t = 0.150 s",
         "speed 333.3 mm/s beyond 250 mm/s (no-load speed) in 'out'", "load 40 kN beyond 30.15 kN (stall force)",
-        "guard 'far out' violated at t = 0.0", "check 'steps': the command does not step here")
+        "guard 'far out' violated at t = 0.0", "check 'steps': the command does not step here",
+        "check 'never': the level was never passed")
         if words not in text] == []
     assert [words for words in ("BEYOND_LIMITS", "<svg", "stall force", "position [mm]", "no-load speed", "load [kN]",
                                 "current [mA]") if words not in page] == []
