@@ -44,14 +44,15 @@ def add_options(parser: argparse._ActionsContainer, options: Sequence[Option | G
             parser.add_argument(*each.names, **each.settings)
 
 
-def parse_integer(text: str, least: int) -> int:
-    """Parse a whole number from `least` on, as an argparse type."""
+def parse_integer(text: str, least: int, most: int = 2**63 - 1) -> int:
+    """Parse a whole number from `least` to `most`, as an argparse type."""
     try:
         value = int(text)
     except ValueError:
         value = least - 1
-    if value < least:
-        raise argparse.ArgumentTypeError(f"expected a whole number from {least}, not {text!r}")
+    if not least <= value <= most:
+        raise argparse.ArgumentTypeError(
+            f"expected a whole number from {least}{f' to {most}' if value > most else ''}, not {text!r}")
     return value
 
 
@@ -159,7 +160,7 @@ COMMANDS = {
              option("--fault", action="append", default=[], metavar="EFFECT=SIZE,..",
                     help="cases: healthy; EFFECT=SIZE,SIZE,..; or two faults in one plant, EFFECT=SIZE/EFFECT=SIZE "
                          "(repeatable)"),
-             option("--seeds", type=parse_whole_number, metavar="N", help="runs of each size (default 20)"),
+             option("--seeds", type=parse_count, metavar="N", help="runs of each size (default 20)"),
              option("--seed", type=parse_whole_number, metavar="N", help="seed of the first run (default 0)"),
              option("--tolerance", metavar="X,..",
                     help="standard deviation of the base parameters, relative (default 0.015)"),
@@ -403,8 +404,8 @@ COMMANDS = {
                 help="write recordings to try other commands on: run.csv, its repeat run2.csv, and held.csv of "
                      "another command, into the folder --out (default: here); the recorded unit has two effects that "
                      "the nominal model lacks"),
-         option("--steps", type=parse_count, metavar="N",
-                help="steps of the plant per cycle (default: one every 10 us)"))),
+         option("--steps", type=partial(parse_integer, least=1, most=100_000), metavar="N",
+                help="steps of the plant per cycle, at most 100000 (default: one every 10 us)"))),
     "trend": Command(
         "follow the fault sizes of one unit through its dated traces: growth, and time left to the limits",
         "Exit status 0 if all faults are within MidBand at the last trace, 1 otherwise.",

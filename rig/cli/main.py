@@ -170,8 +170,8 @@ def run_command_line(words: Sequence[str]) -> int:
 
         from plant import find_compile_error
 
-        compile_error = find_compile_error(error)  # a user's plant file is compiled where it is first needed
-        if compile_error is not None:
+        # a user's plant file is compiled where it is first needed
+        if (compile_error := find_compile_error(error)) is not None:
             return _report_error(name, str(compile_error), compile_error.status)
         print_exc()  # an internal error; Python's own exit status 1 would read as a failed check
         return INTERNAL

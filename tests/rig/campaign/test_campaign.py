@@ -155,6 +155,9 @@ def test_a_folder_belongs_to_one_matrix_one_code_and_one_process(local: Path, tm
     for words, line in (((*MATRIX, "--seeds", 4, "--out", local),
                          "a folder of this matrix, or a new one; it differs in seeds, case"),
                         ((*MATRIX, "--out", tmp_path), "an empty folder"),
+                        (("--fault", "filter_clogging=0.1/filter_clogging=0.2"), "one size for filter_clogging, not"),
+                        (("--fault", "healthy", "--seeds", 0), "--seeds: expected a whole number from 1, not '0'"),
+                        (("--fault", "healthy", "--seed", 2**63), "from 0 to 9223372036854775807"),
                         (("--fault", "coil.resistance=5"),
                          "expected a fault (filter_clogging, spool_friction) or an effect of the catalogue")):
         assert line in refuse("campaign", *words)
