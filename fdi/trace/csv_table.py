@@ -29,6 +29,7 @@ from plant import (
     list_plants,
     report_system_error,
     require,
+    show_value,
 )
 
 COMMENTS = ("#", "%", "//", "!")
@@ -59,7 +60,7 @@ def read_csv(path: Path, signals: Signals) -> tuple[dict[str, Floats], tuple[str
     for name in required:
         hint = "" if len(names) > 1 else " (commas separate columns; rig import reads other separators)"
         require(name in names, f"{path}: line 1", name,
-                f"a column of this name; the header is {','.join(names)[:200]!r}{hint}")
+                f"a column of this name; the header is {show_value(','.join(names))}{hint}")
     return *_read_known(path, names, ",", [name for name in possible if name in names]), "", signals
 
 
