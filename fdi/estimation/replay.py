@@ -283,7 +283,7 @@ def find_rest_rows(position: Floats, period: float, noise: float, window: float 
     rows = 2 * round(0.5 * window / period) + 1
     range_of_noise = 8.0  # RMS, hardly ever exceeded by so few samples of normal noise
     x = hold_next(hold_last(position))
-    rests = maximum_filter1d(x, rows) - minimum_filter1d(x, rows) <= range_of_noise * noise
+    rests = (maximum_filter1d(x, rows) - minimum_filter1d(x, rows) <= range_of_noise * noise) & ~np.isnan(position)
     return extend_flags(maximum_filter1d(rests.astype(np.int8), rows) > 0, round(memory / period))
 
 
@@ -762,6 +762,8 @@ def _fill_inputs(rows: Trace, trace: Trace, source: object, recovery: float = 0.
     if missing_rows:
         notes.append(f"the current is missing in {missing_rows} of {len(trace)} rows; "
                      f"{(~usable).sum() * rows.period:.2g} s of the trace could not be replayed")
+    notes += [f"{name} is missing for {seconds:.1f} s: it is not compared there" for name in rows.outputs if (
+        seconds := float(bridge_gaps(rows.column(name), round(recovery / rows.period))[1].sum()) * rows.period)]
     for name in rows.outputs:
         mover = rows.command if name == rows.declared.controlled.name else rows.controlled
         is_frozen = _find_frozen(rows.column(name), mover, rows.scale)
