@@ -79,10 +79,13 @@ def describe_identification(identification: Identification) -> str:
     run_error = (identification.holdouts or identification.errors)[0]  # the error of its worst signal
     name = max(run_error.before, key=lambda name: run_error.before[name] / run_error.floor[name])
     s = identification.model.kind.signals.find(name)
+    is_cut = 0.0 < run_error.undecided <= HELD_OUT_UNDECIDED_SHARE
+    error = format_amount((run_error.decided if is_cut else run_error.after)[name], s.unit)
+    where = f" in the {format_percent(1.0 - run_error.undecided, 3)} of the run that can be predicted" if is_cut else ""
     count = f"All {number}" if identification.verdict == "IDENTIFIED" else f"{number} of {most}"
     doubt = f" But {identification.reason}." if identification.verdict == "PARTLY" and number == most else ""
     return (f"{count} free parameters are identified: {'held-out run, ' if run_error.is_held_out else ''}{s.symbol} "
-            f"error {format_amount(run_error.before[name], s.unit)} -> {format_amount(run_error.after[name], s.unit)}, "
+            f"error {format_amount(run_error.before[name], s.unit)} -> {error}{where}, "
             f"noise floor {format_amount(run_error.floor[name], s.unit)}.{doubt}")
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from refusals import catch_refusal
 from rig_command import answer, refuse, rig, write_file
+from short_runs import simulate_trace
 
 from fdi.discovery.update_model import read_provenance
 from fdi.estimation import long_recordings, sensor_floors, start_fit
@@ -25,7 +26,7 @@ from fdi.identification.identify import (
 )
 from fdi.report.identify_report import describe_identification
 from fdi.trace import Trace
-from plant import Segment, build_profile, load_model, simulate
+from plant import Segment, build_profile, load_model
 from plant.declare import Chirp, Hold, Ramp, Step
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, simulate_truth
 from studies.identification import sample_actuator
@@ -92,9 +93,11 @@ def test_stops_at_the_wrong_moment_in_a_fitted_run_leave_doubt(identification: I
     verdict, reason = decide_verdict(identification.estimates, [late, *others])
     assert verdict == "PARTLY" and "2.5 noise floors" in reason and first.source.file in reason
     assert "wrong moment" in describe_identification(replace(identification, verdict=verdict, reason=reason))
-    holdout = others[-1]._replace(after={s: 2.5 * floor for s, floor in others[-1].floor.items()})
+    holdout = others[-1]._replace(after={s: 2.5 * floor for s, floor in others[-1].floor.items()}, undecided=0.03)
     assert holdout.is_held_out and decide_verdict(
         identification.estimates, [first, *others[:-1], holdout])[0] == "IDENTIFIED"
+    assert "in the 97.0 % of the run that can be predicted" in describe_identification(
+        replace(identification, errors=(holdout,)))
 
 
 def test_range_that_is_too_narrow_gives_no_model_file(runs: tuple[Trace, Trace, Trace], here: Path,
@@ -177,11 +180,9 @@ LONG = Chirp(amplitude=2e-3, f0=1.0, f1=15.0, fade=15.0, time=3.0)
 
 def record_motor(unit: dict[str, float], *more: Segment, seed: int = 1) -> Trace:
     """An `ema` that rests, and moves by steps, a ramp and `more`."""
-    model = load_model("ema")
     command = build_profile([Hold(time=0.5), Step(to=0.01, time=1.0), Ramp(to=-0.005, time=1.0), *more,
                              Step(to=0.0, time=1.0)], rate=1000.0).command
-    columns = simulate(model.replace(unit), command, seed=seed)._asdict()
-    return Trace.from_columns(columns, 1e-3, {"source": "motor"}, model.kind.signals)
+    return simulate_trace(load_model("ema").replace(unit), command, seed=seed)
 
 
 def test_motor_that_rests_is_identified() -> None:
@@ -190,8 +191,8 @@ def test_motor_that_rests_is_identified() -> None:
     identification = identify([record_motor(unit, Hold(time=1.0))], [], None, "ema")
     assert identification.verdict in ("IDENTIFIED", "PARTLY") and any(
         "at rest" in note for note in identification.notes)
-    is_covered = {e.name: e.low <= unit[e.name] <= e.high for e in identification.estimates if e.name in unit}
-    assert is_covered == dict.fromkeys(unit, True)
+    assert dict.fromkeys(unit, True) == {
+        e.name: e.low <= unit[e.name] <= e.high for e in identification.estimates if e.name in unit}
 
 
 def test_what_no_known_force_shows_has_a_wide_interval() -> None:
