@@ -278,18 +278,16 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     repeat_residuals = [compute_residuals(other, run) for other, run in runs]
     # without repeats, the floor holds what a current that was not recorded leaves open
     widened = {name: f._replace(value=math.hypot(f.value, replay.blind[name])) for name, f in noise.items()}
-    floor = widened | find_floors(replay.residual, repeat_residuals, trace.period)
+    # an effect on readings rounds all repeats alike
+    is_rounded = any(model.find_effect(name).port == "reading" for name in model.effects)
+    least = {s.name: noise[s.name].value if is_rounded and s == trace.declared.controlled else s.finest
+             for s in map(trace.declared.find, noise)}
+    floor = widened | find_floors(replay.residual, repeat_residuals, trace.period, least)
     off_alone = find_rows_off_alone(replay.residual, repeat_residuals, floor)
     replay = replay._replace(undecided=replay.undecided | off_alone)
-    if off_alone.any():
-        floor |= find_floors({name: np.where(off_alone, np.nan, r) for name, r in replay.residual.items()},
-                             repeat_residuals, trace.period)
-    controlled = trace.declared.controlled.name
-    if controlled in floor and any(model.find_effect(name).port == "reading" for name in model.effects):
-        # repeats are rounded alike
-        floor[controlled] = floor[controlled]._replace(value=max(floor[controlled].value, noise[controlled].value))
     left_out = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
     residual = {name: np.where(left_out, np.nan, r) for name, r in replay.residual.items()}
+    floor |= find_floors(residual, repeat_residuals, trace.period, least)  # repeats part there, too
     progress("closed loop", 3 / STAGES)
     loop_residual, (free_error, drift) = replay_command(trace, model), measure_drift(trace, model)
     table = {name: _measure_signal(trace.declared.find(name), r, floor[name], noise[name], loop_residual[name], replay)

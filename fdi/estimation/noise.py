@@ -53,16 +53,18 @@ class Floor(NamedTuple):
 
 
 def find_floors(residual: Mapping[str, Floats], repeats: Sequence[Mapping[str, Floats]],
-                period: float = 1e-3) -> dict[str, Floor]:
+                period: float = 1e-3, least: Mapping[str, float] | None = None) -> dict[str, Floor]:
     """The floor of each signal from the residuals (n,) of the same model on repeats of one command.
 
     Rows correspond; NaN is a missing sample. Signals that no repeat has are left out. Lengths may differ at the end.
+    `least`, in the residual's unit, is a floor that no measured one is below, as where repeats are rounded alike.
     """
     signal_repeats = {name: [repeat[name] for repeat in repeats if name in repeat] for name in residual}
-    return {name: floor_from_repeats(residual[name], runs, period) for name, runs in signal_repeats.items() if runs}
+    return {name: floor_from_repeats(residual[name], runs, period, (least or {}).get(name, 0.0))
+            for name, runs in signal_repeats.items() if runs}
 
 
-def floor_from_repeats(residual: Floats, repeats: Sequence[Floats], period: float = 1e-3) -> Floor:
+def floor_from_repeats(residual: Floats, repeats: Sequence[Floats], period: float = 1e-3, least: float = 0.0) -> Floor:
     """The floor of one signal from its residuals (n,), (m,).. under one model."""
     n = min(len(residual), *(len(r) for r in repeats))
     runs = [residual[:n], *(r[:n] for r in repeats)]
@@ -72,7 +74,7 @@ def floor_from_repeats(residual: Floats, repeats: Sequence[Floats], period: floa
     steady = [_remove_lines(r, lines, period) for r in runs]
     level, share, freedom = measure_quiet_level([(a - b) / np.sqrt(2.0) for a, b in combinations(steady, 2)])
     hum = float(np.sqrt(sum(power for _, power in lines)))
-    return Floor(float(np.hypot(level, hum)), "repeats", False, share, difference, hum, freedom)
+    return Floor(max(float(np.hypot(level, hum)), least), "repeats", False, share, difference, hum, freedom)
 
 
 def floor_from_data(signal: Floats) -> Floor:
