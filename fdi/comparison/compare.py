@@ -273,6 +273,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     require_finite_replay(trace, model)
     noise = sensor_floors(trace, model)
     replay = replay_with_checked_steps(trace, model, {name: f.value for name, f in noise.items()})
+    noise = sensor_floors(trace, model, replay.residual)
     progress("repeats", 2 / STAGES)
     runs = [(other, replay_current(other, model, replay.steps)) for other in repeats]
     repeat_residuals = [compute_residuals(other, run) for other, run in runs]

@@ -104,15 +104,17 @@ def _measure_spectrum(second: Floats) -> float:
     return float(np.sqrt(np.median(power) / np.log(2.0)))  # power is distributed exponentially
 
 
-def sensor_floors(trace: Trace, model: Model) -> dict[str, Floor]:
+def sensor_floors(trace: Trace, model: Model, residual: Mapping[str, Floats] | None = None) -> dict[str, Floor]:
     """The floors without repeats: the model's sensor noise, or the data's own where that is more or none is given.
 
-    What a replay takes over of the controlled signal's noise is in them: see `compute_anchor_noise`.
+    What a replay takes over of the controlled signal's noise is in them: see `compute_anchor_noise`. A signal moves
+    from row to row where the controller answers noisy readings; the `residual`, (n,) each, of a replay has less of it.
     """
     floors = {}
     anchor_noise = compute_anchor_noise(trace, model)
     for name in trace.outputs:
-        signal, data_floor = trace.declared.find(name), floor_from_data(trace.mask_unusable(name))
+        signal, own = trace.declared.find(name), [trace.mask_unusable(name), *([residual[name]] if residual else [])]
+        data_floor = min((f for f in map(floor_from_data, own) if f.value > 0.0), default=floor_from_data(own[0]))
         level = (simulate_reading_noise(model, trace.controlled) if signal == trace.declared.controlled else
                  model.values.get(signal.noise, 0.0))
         share = 1.0

@@ -32,6 +32,7 @@ from fdi.estimation import (
     can_be_cut,
     choose_excerpt,
     compute_misfit,
+    compute_residuals,
     compute_typical_rms,
     compute_values,
     cut_excerpt,
@@ -50,6 +51,7 @@ from fdi.estimation import (
     match_period,
     prepare_trace,
     remove_slope,
+    replay_current,
     require_finite_replay,
     scale_noise,
     scaled_bounds,
@@ -570,7 +572,7 @@ def identify_model(model: Model, ranges: Sequence[Range], fitted_runs: Sequence[
     fitted_runs = [leave_out_rest(t, model) for t in fitted_runs]
     notes = [f"{source.file}: {note}" for trace, source in zip((*fitted_runs, *held_out_runs), sources, strict=True)
              for note in trace.notes]
-    floors = [sensor_floors(t, model) for t in fitted_runs]
+    floors = [sensor_floors(t, model, compute_residuals(t, replay_current(t, model))) for t in fitted_runs]
     floor = {s: float(np.median([f[s].value for f in floors if s in f])) for s in fitted_runs[0].output_names
              if any(s in f for f in floors)}
     if not any(_moves(t) for t in fitted_runs):
