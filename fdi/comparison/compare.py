@@ -54,6 +54,7 @@ from fdi.thresholds import (
     LAG_MISFIT_RATIO,
     LOWER_BOUND_ERROR_RATIO,
     REPEAT_DIFFERENCE_RATIO,
+    REPEAT_FLOOR_RATIO,
     RUN_FITS,
     RUN_IS_OFF,
     SECTION_ERROR_SD,
@@ -286,7 +287,8 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     floor = widened | find_floors(replay.residual, repeat_residuals, trace.period, least)
     off_alone = find_rows_off_alone(replay.residual, repeat_residuals, floor)
     replay = replay._replace(undecided=replay.undecided | off_alone)
-    left_out = replay.undecided & (replay.undecided.mean() <= UNDECIDED_SHARE)
+    undecided_share = float(replay.undecided[trace.usable].mean())  # of the rows that a replay is judged on
+    left_out = replay.undecided & (undecided_share <= UNDECIDED_SHARE)
     residual = {name: np.where(left_out, np.nan, r) for name, r in replay.residual.items()}
     floor |= find_floors(residual, repeat_residuals, trace.period, least)  # repeats part there, too
     progress("closed loop", 3 / STAGES)
@@ -300,7 +302,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     m = describe_motion(trace, replay.model)
     z2 = combine_residuals(residual, {name: f.value for name, f in floor.items()})
     sections, condition = locate_error(trace, z2, m, answer.limit), find_condition(z2, m, answer.limit)
-    verdict, reason = _decide_verdict(table, sections, ratios, replay, trace.period, doubtful)
+    verdict, reason = _decide_verdict(table, sections, ratios, replay, undecided_share, trace.period, doubtful)
     diagnoses = examine_residuals(trace, residual, {name: (replay.residual[name] - r) / math.sqrt(2.0)
                                      for name, r in (repeat_residuals[0] if repeat_residuals else {}).items()}, m)
     progress("tolerances", 6 / STAGES)
@@ -312,7 +314,7 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
                       _list_blocks_above(ratios, table), tuple(sections), condition, free_error, drift,
                       measure_drive_error(trace, model), scatter, diagnoses, replay, len(repeats),
                       (*trace.notes, *([doubtful] if doubtful and verdict != "CANNOT_TELL" else []),
-                       *_list_notes(floor, replay, trace, off_alone)))
+                       *_list_notes(floor, left_out, replay, trace, off_alone)))
 
 
 def find_rows_off_alone(residual: Columns, repeats: Sequence[Columns], floor: Mapping[str, Floor]) -> Flags:
@@ -395,38 +397,44 @@ def _list_blocks_above(ratios: Mapping[str, float | None], table: Mapping[str, S
 
 
 def _decide_verdict(table: Mapping[str, SignalError], sections: Sequence[Place], ratios: Mapping[str, float | None],
-                    replay: Replay, period: float, doubtful: str) -> tuple[str, str]:
+                    replay: Replay, undecided_share: float, period: float, doubtful: str) -> tuple[str, str]:
     """The verdict, and why it cannot tell; `doubtful` says why the repeats are no measure of the noise."""
     if coarse := [s.signal.name for s in table.values() if s.solver_error > SOLVER_HIDES_RATIO * s.floor.value]:
         return "CANNOT_TELL", f"the solver's own error in {', '.join(coarse)} is as large as the floor"
     above = [s for s in table.values() if s.ratio > s.limit]
     least = min((s.floor.freedom for s in table.values()), default=1.0)
 
-    # what a drive that was not recorded leaves open is no noise: it gathers in the fast sections
+    # what a drive that was not recorded leaves open is no noise: it gathers in the fast sections, and hides errors
     is_open_alike = all(replay.blind[name] < 0.5 * s.floor.value for name, s in table.items())
     local = [p for p in sections if is_open_alike and p.ratio > SIGNAL_ERROR_RATIO + SECTION_ERROR_SD / math.sqrt(
         max(1.0, 2 * least * (p.t1 - p.t0) / period))]
+    is_hidden = not is_open_alike and any(
+        s.error > s.limit * s.sensor_noise
+        and s.floor.value > (REPEAT_FLOOR_RATIO if s.floor.source == "repeats" else 1.0) * s.sensor_noise
+        for s in table.values())
+    open_doubt = "rows of the current were not recorded, and the error may be what they leave open"
     if not (above or local or _list_blocks_above(ratios, table)):
         apart = _list_apart((s.signal, s.floor) for s in table.values())
         if apart and not doubtful:
             doubtful = (f"the model fits this trace but not its repeat: they differ by more than noise "
                         f"({apart} noise floors). Use repeats of the same unit")
+        doubtful = doubtful or (open_doubt if is_hidden else "")
         return ("CANNOT_TELL", doubtful) if doubtful else ("WITHIN_FLOOR", "")
-    edgy = float(replay.undecided.mean())
     doubt = ""
     if any(s.floor.lower_bound for s in table.values()):
         doubt = "without a repeat the floor is only a lower bound, and the error is not far above it"
     elif not is_open_alike:
-        doubt = "rows of the current were not recorded, and the error is not far above what they leave open"
-    elif edgy > UNDECIDED_SHARE:
-        doubt = f"{100 * edgy:.0f} % of the trace {_describe_cause(replay)}"
-    is_sure = any(s.ratio > LOWER_BOUND_ERROR_RATIO or (is_open_alike and edgy <= UNDECIDED_SHARE
+        doubt = open_doubt
+    elif undecided_share > UNDECIDED_SHARE:
+        doubt = f"{100 * undecided_share:.0f} % of the trace {_describe_cause(replay)}"
+    is_sure = any(s.ratio > LOWER_BOUND_ERROR_RATIO or (is_open_alike and undecided_share <= UNDECIDED_SHARE
                                                         and not s.floor.lower_bound) for s in above)
     is_open = doubt and not is_sure and (ratios["controller"] or 0.0) <= CONTROLLER_ERROR_RATIO
     return ("CANNOT_TELL", doubt) if is_open else ("MODEL_INCOMPLETE", "")
 
 
-def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace, off_alone: Flags) -> Iterator[str]:
+def _list_notes(floor: Mapping[str, Floor], left_out: Flags, replay: Replay, trace: Trace, off_alone: Flags
+                ) -> Iterator[str]:
     """What a reader must know about the floor and about rows left out."""
     yield from (f"{name} of the model passes the sensor of the trace: "
                 f"{sensor.describe(trace.period, trace.units[name])}"
@@ -435,8 +443,8 @@ def _list_notes(floor: Mapping[str, Floor], replay: Replay, trace: Trace, off_al
         yield f"flow and force are not balanced: {', '.join(trace.filtered)} is filtered by its sensor"
     if apart := _list_apart((trace.declared.find(name), f) for name, f in floor.items()):
         yield f"the error differs between the repeats, as with stick-slip: {apart} noise floors"
-    if replay.undecided.any() and replay.undecided.mean() <= UNDECIDED_SHARE:
-        seconds, alone = (float(rows.sum()) * trace.period for rows in (replay.undecided & ~off_alone, off_alone))
+    if left_out.any():
+        seconds, alone = (float(rows.sum()) * trace.period for rows in (left_out & ~off_alone, off_alone))
         if seconds:
             yield (f"{seconds:.1f} s are not judged: whether the {trace.declared.controlled.phrase} stops "
                    f"{_describe_cause(replay)}")

@@ -189,8 +189,10 @@ STICK_SLIP = {"stribeck.rise": 0.5, "stribeck.speed": 0.004}
 
 
 @pytest.mark.parametrize(("unit", "model", "seeds", "rows", "verdict"), [
-    (STICK_SLIP, STICK_SLIP, (4, 14), 1, "WITHIN_FLOOR"), (STICK_SLIP, STICK_SLIP, (1,), 1, "WITHIN_FLOOR")],
-    ids=["slips that differ", "no repeat"])
+    (STICK_SLIP, STICK_SLIP, (4, 14), 1, "WITHIN_FLOOR"), (STICK_SLIP, STICK_SLIP, (1,), 1, "WITHIN_FLOOR"),
+    ({"screw.backlash": 1e-5}, {}, (1,), 2, "CANNOT_TELL"),
+    ({"screw.backlash": 3e-5}, {}, (1, 2), 2, "MODEL_INCOMPLETE")],
+    ids=["slips that differ", "no repeat", "every second row", "every second row, with a repeat"])
 def test_the_floor_of_a_motor_is_its_sensors_noise(unit: dict[str, float], model: dict[str, float],
                                                    seeds: tuple[int, ...], rows: int, verdict: str) -> None:
     """Its current follows the noise that its controller reads; what a lost current leaves open is no noise either."""
