@@ -154,8 +154,8 @@ def test_a_sensor_that_hangs_is_left_out_while_it_does() -> None:
     (c,) = read_cycles(made(**spoil("p12", slice(9000, 10_000), value=record_healthy().p12[9000])), MODEL)
     assert not c.usable[9000:10_000].any() and c.usable.sum() == 12_500
     assert "p12 is frozen for 1.00 s, first at 9.00 s" in c.notes[0]
-    coarse = np.round(record_healthy().xj / 2e-3) * 2e-3  # a converter of a few bits rests for long, and is alive
-    assert read_cycles(made(xj=coarse), MODEL)[0].usable.all()
+    # a converter of a few bits rests for long, and is alive
+    assert read_cycles(made(xj=np.round(record_healthy().xj / 2e-3) * 2e-3), MODEL)[0].usable.all()
     dead = spoil("xs", slice(11_000, None), value=record_healthy().xs[11_000])
     assert not read_cycles(made(**dead), MODEL)[0].usable[11_000:].any()
 
