@@ -462,7 +462,7 @@ def answer(verdict: str, effects: tuple[str, ...], *candidates: Candidate, is_at
     trace = SimpleNamespace(declared=EHA, notes=(), events=())
     explanation = SimpleNamespace(verdict=verdict, effects=effects, base=base, floor=FLOOR, marks=Marks(1.0, 1e-6, ()),
                                   ledger=[base], unseen={}, holdout={}, excerpt="", ranked=ranked,
-                                  search=SimpleNamespace(problem=SimpleNamespace(trace=trace)))
+                                  search=SimpleNamespace(problem=SimpleNamespace(trace=trace), model=Model()))
     baseline = {"error": ERROR, "floor": FLOOR, "holdout": {"xj": 44e-6, "p12": 3e5}}
     blind = (Blind("sensor_gain", "sensor_gain.error", 0.02, "1", "a stop"),
              Blind("sensor_offset", "sensor_offset.offset", 1e-4, "m", "a stop"))
