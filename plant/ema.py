@@ -305,8 +305,9 @@ base_effect("moving_mass", Surface, "mass", law="M x''", symptoms="the current g
 base_effect("screw_compliance", Screw, "compliance", law="F = (z - x)/compliance",
             symptoms="the surface follows the motor later, the more the larger the force; a resonance",
             starts=(2e-8, 5e-8, 2e-7), source="axial stiffness of screw and nut, ISO 3408-4")
-base_effect("torque_gain", Motor, "torque_constant", law="T = Kt i", symptoms="all forces need more current, or less",
-            starts=(0.18, 0.14, 0.22), source="loss of magnetisation by heat")
+base_effect("torque_gain", Motor, "torque_constant", law="T = Kt i, Ke = Kt", starts=(0.18, 0.14, 0.22),
+            symptoms="all forces need more current, or less: weak magnets, by their share",
+            source="torque and electromotive force in proportion to the magnets' flux, Krishnan 2010")
 
 
 @effect("friction", {  # By what fraction the friction is higher in extension, and lower in retraction.

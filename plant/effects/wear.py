@@ -1,6 +1,7 @@
 """Wear and damage of the servovalve that `rig fdi` measures with the list of faults "wider".
 
-Each law is that of its source; what a signal shows of it looks like a parameter of the reference model, so `rig
+Magnets and coil are those of the torque motor, whose current is the demanded one: a drive with a current loop asks for
+more voltage instead, and weak magnets are a smaller torque constant there. Each law is that of its source; what a signal shows of it looks like a parameter of the reference model, so `rig
 explain` names that parameter and does not test these effects unasked.
 
 The first six faults of the list are those of Dalla Vedova, Maggiore and Pace, "Proposal of Prognostic Parametric Method
@@ -21,7 +22,7 @@ NOWHERE = ("none",)  # plants in which rig explain tests them unasked
 @effect("current", {  # Share of the torque that the magnets of the torque motor have lost.
     "share": Quantity("1", "d", low=0, below=1, typical="0.05-0.3"),
 }, law="Tact = GM (1 - d) Cor - KSF XS", symptoms="same as a smaller gain of the motor", starts=(0.05, 0.2),
-    confused_with=("torque_motor.gain",), searched_in=NOWHERE,
+    confused_with=("torque_motor.gain",), searched_in=NOWHERE, plant="eha",
     revealed_by="a torque or flux measurement of the motor alone",
     source="torque of a polarised motor in proportion to its magnets' flux, Merritt 1967")
 def magnet_loss(x: float, s: Any, u: Any, p: Any) -> float:
@@ -39,7 +40,7 @@ Flux = namedtuple("Flux", "current", defaults=(0.0,))
 }, off={"time_constant": 3e-3}, memory=Flux, fitted=("share",), starts=(0.05, 0.2),
     confused_with=("torque_motor.gain",),
     law="s L/R i' + i = (1 - s) Cor: the turns left drive the flux, the shorted ones slow it down",
-    symptoms="less gain, and a lag that grows with it", searched_in=NOWHERE,
+    symptoms="less gain, and a lag that grows with it", searched_in=NOWHERE, plant="eha",
     revealed_by="the coil's resistance, R (1 - s)",
     source="transformer with a shorted secondary of s N turns and resistance s R, whose time constant is s L/R")
 def coil_short(x: float, m: Flux, s: Any, u: Any, p: Any) -> tuple[float, Flux]:

@@ -9,7 +9,16 @@ from effects_cases import EASY, QUIET_SPOOL, WHOLE, H, drive_plant, measure_spee
 from node_bench import FirmwareHarness
 from physics_cases import SMOOTH
 
-from plant import Actuator, Input, Model, compute_answers, interpret_function, simulate, unpack_state
+from plant import (
+    Actuator,
+    Input,
+    Model,
+    compute_answers,
+    interpret_function,
+    list_offered_effects,
+    simulate,
+    unpack_state,
+)
 from plant.effects import CATALOGUE
 from plant.effects.current import coil_lag, current_noise
 from plant.effects.sensors import Recoil, mount_compliance, sensor_lag
@@ -361,7 +370,7 @@ def build(name: str, value: float) -> tuple[Model, object, Line]:
 
 
 def test_explain_does_not_search_them_and_each_has_a_source() -> None:
-    assert not set(WEAR) & set(CATALOGUE)
+    assert not set(WEAR) & {*CATALOGUE, *(e.name for e in list_offered_effects("ema"))}
     assert all(CATALOGUE[name].source and CATALOGUE[name].revealed_by for name in WEAR)
 
 

@@ -88,6 +88,8 @@ def _tabulate_effects(effects: Sequence[Effect], descriptions: Sequence[Mapping[
 def _list_properties(e: Effect, row: Mapping[str, Any], plant: str) -> list[Item]:
     port = f"{e.port} ({find_plant(plant).ports[e.port].unit})" if e.port else "the reference model itself"
     properties = [("law", row["law"]), ("acts on", port), ("symptoms", row["symptoms"]), ("source", e.source),
+                  ("rig explain", "does not test it unasked: it names what looks the same" if e.searched_in and
+                   plant not in e.searched_in else ""),
                   ("confused with", ", ".join(e.confused_with)), ("excludes", ", ".join(e.excludes))]
     parameters = [(f"{name} in {p['unit']}", filter(None, (
         p["expected"], f"off at {p['off']:g}", p["typical"] and f"typically {p['typical']}",
