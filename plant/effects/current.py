@@ -69,11 +69,14 @@ Switched = namedtuple("Switched", "side since", defaults=(0.0, 0.0))
     symptoms="a reversal costs the same time whatever the speed", memory=Switched, starts=(0.02, 0.05, 0.1),
     searched_in=("ehs",), source="data sheets of directional valves: switching times")
 def valve_switching(x: float, m: Switched, s: Any, u: Any, p: Any) -> tuple[float, Switched]:
-    """The valve's spool travels from one side to the other: the flow waits. The first side is taken at once."""
+    """The valve's spool travels from one side to the other: the flow waits. The first side is taken at once.
+
+    A step in which the time ends gets the mean, so that a fit sees a slope between whole steps.
+    """
     side = 1.0 if x > 0.0 else -1.0 if x < 0.0 else m.side
     reverses = side * m.side < 0.0
     since = 0.0 if reverses else m.since + u.h if m.side * side > 0.0 else p.valve_switching.time
-    return (x if since >= p.valve_switching.time else 0.0), Switched(side, since)
+    return x * (1.0 - _share((p.valve_switching.time - since) / u.h)), Switched(side, since)
 
 
 @effect("current", {  # What the driver's limit is short of Imax, as a fraction of it.
