@@ -1,7 +1,8 @@
 """An electro-hydrostatic position servo: a motor turns a pump, the pump moves a ram that presses against a load.
 
-Nominal is the bare integrator, a ram as fast as the pump delivers; what else there is, `rig explain` has to find. Rig
-and data: github.com/ivliev123/Electro-Hydraulic-Actuator; "raw" is the unit of its motor speed, not stated there.
+Nominal is the bare integrator, a ram as fast as the pump delivers; what else there is, `rig explain` has to find: the
+load of a recording is that of a press, and how it acts on the ram (`loaded_by`) is part of the question. Rig and data:
+github.com/ivliev123/Electro-Hydraulic-Actuator; "raw" is the unit of its motor speed, not stated there.
 """
 from collections import namedtuple
 from collections.abc import Mapping
@@ -213,6 +214,7 @@ PLANT = Plant(
     variants={"compute_compliance": (update_compliance, frozenset())},
     values=NOMINAL,
     has=("quantisation",),
+    loaded_by=("external_load", "one_way_load"),
     shared_starts=True,
     lacks=("constant_load", "aero_stiffness", "sensor_gain", "sensor_lag", "sensor_offset"),
     scatter={"pump.displacement": 0.1},

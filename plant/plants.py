@@ -120,6 +120,7 @@ class Plant:
     values: Mapping[str, float] = field(default_factory=dict, repr=False)  # nominal, in place of the types' defaults
     has: tuple[str, ...] = ()  # effects of the nominal model
     lacks: tuple[str, ...] = ()  # shared effects that cannot be
+    loaded_by: tuple[str, ...] = ()  # effects through which alone its load acts; none: its step takes it
     shared_starts: bool = False  # the starts of shared effects, which are those of the EHA, suit it
     scatter: Mapping[str, float] | None = None  # tolerances, a fraction, of parameters; None: as their types say
     balances: bool = False  # `plant.forced` balances flow and force of its jack, as measured signals have them

@@ -17,6 +17,15 @@ def constant_load(x: float, s: Any, u: Any, p: Any) -> float:
     return x + p.constant_load.force
 
 
+@effect("load", {  # Part of the load that acts both ways.
+    "share": Quantity("1", low=-2, high=2, typical="1"),
+}, law="FR = FR + share load", symptoms="P12 follows the load in both directions", plant="ehs",
+    starts=((1.0,), (0.5,), (-1.0,)), revealed_by="a run against a known load", source="a weight, or a second cylinder")
+def external_load(x: float, s: Any, u: Any, p: Any) -> float:
+    """The load of the recording is a force on the ram; that of a press acts otherwise, see `one_way_load`."""
+    return x + p.external_load.share * u.load
+
+
 @effect("load", {  # Hinge moment of the surface per unit of ram position.
     "stiffness": Quantity("N/m", low=0, high=1e9, typical="1e5-1e6 N/m"),
 }, law="FR = FR + K XJ", symptoms="P12 proportional to position, at rest too", starts=(1e5, 3e5, 1e6),

@@ -1,8 +1,9 @@
 """Wear and damage of the servovalve that `rig fdi` measures with the list of faults "wider".
 
-Magnets and coil are those of the torque motor, whose current is the demanded one: a drive with a current loop asks for
-more voltage instead, and weak magnets are a smaller torque constant there. Each law is that of its source; what a signal shows of it looks like a parameter of the reference model, so `rig
-explain` names that parameter and does not test these effects unasked.
+Magnets and coil are those of the torque motor, whose current is the demanded one: a drive with a current loop asks
+for more voltage instead, and weak magnets are a smaller torque constant there. Each law is that of its source; what a
+signal shows of it looks like a parameter of the reference model, so `rig explain` names that parameter and does not
+test these effects unasked.
 
 The first six faults of the list are those of Dalla Vedova, Maggiore and Pace, "Proposal of Prognostic Parametric Method
 Applied to an Electrohydraulic Servomechanism Affected by Multiple Failures", after Borello, Dalla Vedova, Jacazio and

@@ -413,12 +413,14 @@ def test_the_loggers_columns() -> None:
     np.testing.assert_allclose(compute_centred_mean(k, 9)[4:-4], k[4:-4], rtol=1e-12)
 
 
-def test_the_load_of_a_press_is_the_sum_of_both_directions() -> None:
+def test_the_load_of_a_press_is_the_sum_of_both_directions_and_acts_both_ways_by_its_share() -> None:
     """10 bar of load out and none back, friction of 8 bar both ways; the pressure at rest does not count."""
     way = np.r_[np.zeros(500), np.full(1000, 1.0), np.zeros(500), np.full(1000, -1.0), np.zeros(500)]
-    p12 = np.where(way > 0, 18e5, np.where(way < 0, -8e5, 40e5))
-    load = estimate_load_in_motion({"xj": np.cumsum(way) * 1e-5, "p12": p12})
-    assert load == pytest.approx(np.full(len(way), 10e5 * load_model("ehs")["jack.area"]))
+    load = estimate_load_in_motion({"xj": np.cumsum(way) * 1e-5,
+                                    "p12": np.where(way > 0, 18e5, np.where(way < 0, -8e5, 40e5))})
+    p12 = simulate(load_model("ehs").replace({"external_load.share": 0.5, "sensors.pressure_noise": 0.0}),
+                   np.zeros(20), load[:20], steps=4, fast=False).p12[-1]
+    assert [*load / load_model("ehs")["jack.area"], 2.0 * p12] == pytest.approx([10e5] * (len(way) + 1))
 
 
 @pytest.mark.parametrize("name", GENERAL)
@@ -452,10 +454,13 @@ def test_nominal_is_an_integrator_and_unequal_areas_make_it_faster_backwards() -
     assert -forwards / backwards == pytest.approx(0.68, rel=1e-6)
 
 
-def test_the_bench_refuses_it() -> None:
-    """It declares no nominal test, with its own controller or another."""
-    assert "a sequence of your own" in refuse("run", "--model", "ehs")
-    assert "a sequence of your own" in refuse("run", "--model", "ehs", "--bench", "eha")
+@pytest.mark.parametrize(("words", "message"), [
+    ("run", "a sequence of your own"), ("run --bench eha", "a sequence of your own"),
+    ("simulate --command push.csv", "push.csv: load: expected 0, or a model in which it acts: --set external_load")])
+def test_a_test_that_it_does_not_declare_and_a_load_that_acts_nowhere_are_refused(
+        here: Path, words: str, message: str) -> None:
+    write_file(here / "push.csv", "t,com,load\n0,0,100\n0.001,0,100\n")
+    assert message in refuse(*words.split(), "--model", "ehs")
 
 
 AJ = Model()["jack.area"]

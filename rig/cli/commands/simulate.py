@@ -25,6 +25,10 @@ def run_command(args: argparse.Namespace) -> int:
     period = model["controller.period"]
     signals = model.kind.signals
     com, load, name = load_command(args.command_file, period, model.kind)
+    ways = model.kind.loaded_by
+    options = " or ".join(f"--set {model.find_effect(e).fitted[0]}=1" for e in ways)
+    require(load is None or not load.any() or not ways or {*ways} & {*model.effects}, name, "load",
+            f"0, or a model in which it acts: {options}")
     require(not args.steps or model.kind.foreign is None, "--steps", str(args.steps),
             "a plant with equations; an FMU has steps of its own")
     out = Path(args.out or "simulation.csv")
