@@ -26,9 +26,8 @@ def run_command(args: argparse.Namespace) -> int:
     signals = model.kind.signals
     com, load, name = load_command(args.command_file, period, model.kind)
     ways = model.kind.loaded_by
-    options = " or ".join(f"--set {model.find_effect(e).fitted[0]}=1" for e in ways)
-    require(load is None or not load.any() or not ways or {*ways} & {*model.effects}, name, "load",
-            f"0, or a model in which it acts: {options}")
+    require(not ways or load is None or not load.any() or {*ways} & {*model.effects}, name, "load",
+            "0, or a model in which it acts: " + " or ".join(f"--set {model.find_effect(e).fitted[0]}=1" for e in ways))
     require(not args.steps or model.kind.foreign is None, "--steps", str(args.steps),
             "a plant with equations; an FMU has steps of its own")
     out = Path(args.out or "simulation.csv")
@@ -69,15 +68,14 @@ def write_samples(args: argparse.Namespace) -> int:
     other = build_profile((Points(points=SAMPLE_POINTS),)).command
     runs = {"run.csv": usual, "run2.csv": usual, "held.csv": other}
     places = {name: require_new(folder / name, is_forced=args.force) for name in runs}
-    steps = args.steps or 400  # a cycle: finer than those of a fit, as a real unit is
     for seed, (name, com) in enumerate(runs.items(), args.seed + 1):
-        columns = simulate(model, com, load[:len(com)], seed, steps)
+        # steps a cycle finer than those of a fit, as a real unit is
+        columns = simulate(model, com, load[:len(com)], seed, args.steps or 400)
         Trace.from_columns(columns._asdict(), period, {"seed": str(seed)},
                            model.kind.signals).write_csv(places[name])
-    sentence = (f"{', '.join(map(str, places.values()))}: a run, its repeat, and a run of another command. Next: "
-                f"rig compare {places['run.csv']} --repeat {places['run2.csv']}")
-    return give_answer(Report("simulate", "samples", sentence=sentence,
-                              data={"traces": [str(place) for place in places.values()]}), args)
+    return give_answer(Report("simulate", "samples", data={"traces": [*map(str, places.values())]}, sentence=(
+        f"{', '.join(map(str, places.values()))}: a run, its repeat, and a run of another command. Next: "
+        f"rig compare {places['run.csv']} --repeat {places['run2.csv']}")), args)
 
 
 def load_command(file: str | None, period: float, kind: Plant) -> tuple[Any, Any, str]:
