@@ -134,6 +134,12 @@ GAIN_WORTH_A_FIT = 20.0
 # Excess error over that before, below which an effect is a part of the explanation.
 ERROR_PARTLY_EXPLAINED = 0.8
 
+# Times its error without an effect, or the noise floor, beyond which a signal is worse with it: it is then no part.
+#
+# A wrong motor speed was called 1067 N s/m of damping: the speed's error fell from 37 floors to 2, the position's rose
+# from 1 to 9.
+SIGNAL_SPOILED = 2.0
+
 # Share of the excess cost that an effect must remove for another one to be looked for on top of it.
 FURTHER_EFFECT_SHARE = 0.1
 

@@ -74,6 +74,7 @@ from fdi.thresholds import (
     HELD_OUT_UNDECIDED_SHARE,
     INTERVAL_95_SD,
     RESIDUAL_HELD_OUT,
+    SIGNAL_SPOILED,
     SOLVER_ERROR_SHARE,
 )
 from fdi.trace import Floats, Trace, find_comb, hold_last, is_rounding_left, measure_resolution
@@ -262,7 +263,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     close = leave_out_unneeded(search, _spare_far_tolerances(search, base, close))
     depth = len(close[0].effects) if close else 0
     level = levels[depth or -1] if max(depth, 1) < len(levels) else []
-    others = search.map_parallel(search.replay_hypothesis,
+    others = search.map_parallel(lambda h: judge_left_out_rows(search, search.replay_hypothesis(h), floor),
                                  (h for h in level if h.effects not in [c.effects for c in close]))
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
     if not close and (own := search.hold_own_effects(base)):
@@ -483,9 +484,7 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
         if len(equal) > 1:
             return "AMBIGUOUS", (*prints, *_list_effects(equal))
         return "EXPLAINED", (*prints, *explanations[0].effects)
-    excess, base_excess = (measure_excess(h.errors, floor) for h in (best, base))
-    is_better = min(excess, 1e18) < ERROR_PARTLY_EXPLAINED**2 * base_excess
-    if is_better and part:
+    if part and explains_part(base, best, floor):
         return "PARTLY", (*prints, *best.effects)
     return ("PARTLY" if prints else "UNEXPLAINED"), prints
 
@@ -498,6 +497,13 @@ def _is_better(h: Hypothesis, other: Hypothesis, unseen: Mapping[tuple[str, ...]
     """Whether one hypothesis explains more than another: its own runs, and these and the held-out run together."""
     gain = measure_gain(other, h)
     return gain >= GAIN_TIE and gain + unseen[other.effects] - unseen[h.effects] >= GAIN_CONVINCES
+
+
+def explains_part(base: Hypothesis, h: Hypothesis, floor: Mapping[str, float]) -> bool:
+    """Whether a hypothesis takes away a share of the base's excess, and makes no signal much worse."""
+    excess, base_excess = (measure_excess(each.errors, floor) for each in (h, base))
+    is_spoiled = any(h.errors[s] > SIGNAL_SPOILED * max(before, floor[s]) for s, before in base.errors.items())
+    return min(excess, 1e18) < ERROR_PARTLY_EXPLAINED**2 * base_excess and not is_spoiled
 
 
 def measure_excess(errors: Mapping[str, float], floor: Mapping[str, float]) -> float:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi.discovery.detectable import Blind, find_separation
-from fdi.discovery.explain import Explanation, Fingerprint, explain, measure_gain
+from fdi.discovery.explain import Explanation, Fingerprint, explain, explains_part, measure_gain
 from fdi.discovery.laws.find_law import LawSearch, find_law_beside
 from fdi.discovery.laws.terms import write_law_file
 from fdi.discovery.residual_pattern import UNBALANCED, Pattern, can_balance, find_pattern, write_effect
@@ -32,10 +32,8 @@ from fdi.progress import Progress, ignore_progress
 from fdi.thresholds import (
     EFFECT_INTERVAL_FACTOR,
     EFFECT_SYSTEMATIC_SD,
-    ERROR_PARTLY_EXPLAINED,
     INTERVAL_95_SD,
     RESIDUAL_HELD_OUT,
-    RESIDUAL_IS_NOISE,
     SUSPICIOUS_TOLERANCES,
 )
 from plant import (
@@ -299,11 +297,11 @@ def _list_candidates(e: Explanation, seed: int) -> list[Candidate]:
 def _describe_candidate(e: Explanation, h: Hypothesis, effect: str, seed: int) -> Candidate:
     gain, extra = measure_gain(e.base, h), _count_unknown(h.fit) - _count_unknown(e.base.fit)
     samples = sum(int(np.isfinite(run.measurements).sum()) for run in (e.search.problem.trace, *e.search.problem.also))
-    charge = 0.5 * extra * math.log(samples) + len(h.effects) * math.log(max(len(e.search.effects), 1))
+    evidence = 0.5 * (gain - extra * math.log(samples)) - len(h.effects) * math.log(max(len(e.search.effects), 1))
     values = list_fitted_parameters(effect, h.fit, e.search.problem.model)
     return Candidate(effect, tuple(x for x in h.effects if x != effect), values, dict(h.errors),
-                     dict(e.holdout.get(h.effects, {})), dict(h.ratio), 0.5 * gain - charge,
-                     compute_p_value(e.blind, gain, max(extra, 1), seed), _choose_word(e, h, effect))
+                     dict(e.holdout.get(h.effects, {})), dict(h.ratio), evidence,
+                     compute_p_value(e.blind, gain, max(extra, 1), seed), _choose_word(e, h, effect, evidence))
 
 
 def _count_unknown(fit: Fit) -> int:
@@ -311,17 +309,17 @@ def _count_unknown(fit: Fit) -> int:
     return sum(not np.isfinite(f.prior) for f in fit.free)
 
 
-def _choose_word(e: Explanation, h: Hypothesis, effect: str) -> str:
-    """What to think of an effect, in a word or two."""
+def _choose_word(e: Explanation, h: Hypothesis, effect: str, evidence: float) -> str:
+    """What to think of an effect, in a word or two; a part only where the evidence is for it."""
     words = {"EXPLAINED": "explains", "AMBIGUOUS": "equal", "PARTLY": "part", "NOT_RESOLVABLE": "too small to be sure"}
     if effect in e.effects and e.verdict in words:
         return words[e.verdict]
-    worst, before = max(h.ratio.values()), max(e.base.ratio.values())
-    if worst <= RESIDUAL_IS_NOISE and not e.base.is_at_floor:
+    if h.is_at_floor and not e.base.is_at_floor:
         holdout = e.holdout.get(h.effects, {})
         fails = any(error > RESIDUAL_HELD_OUT * e.floor[s] for s, error in holdout.items())
         return "fails on the held-out run" if fails else "less likely"
-    return "part" if worst - 1.0 < ERROR_PARTLY_EXPLAINED * (before - 1.0) and not e.base.is_at_floor else "no"
+    is_part = evidence > 0.0 and not e.base.is_at_floor and explains_part(e.base, h, e.floor)
+    return "part" if is_part else "no"
 
 
 def _describe_mark(e: Explanation, p: Fingerprint) -> Candidate:

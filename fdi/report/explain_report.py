@@ -193,12 +193,17 @@ def _describe_unexplained(a: Answer) -> str:
                 f"difference{describe_gains(compare_controller(e.search.problem.trace, e.search.problem.model))}."
                 if e.marks.is_firmware_different else
                 "The model fits this run, but not the held-out run; this run does not show what is missing.")
-    worst, signals = _find_worst_signal(a), find_signals(a)
-    best = next(iter(a.candidates), None)
-    return (f"No effect of the catalogue explains the residual: {signals.find(worst).symbol} error "
-            f"{_format(a.baseline['error'], worst, signals)}, noise floor "
-            f"{_format(a.baseline['floor'], worst, signals)}"
-            + (f"; the best, {best.effect}, leaves {_format(best.error, worst, signals)}." if best else "."))
+    floor, signals = a.baseline["floor"], find_signals(a)
+    worst, best = _find_worst_signal(a.baseline["error"], floor), min(a.candidates, key=lambda c: c.ratio, default=None)
+
+    def describe_error(error: BySignal, s: str) -> str:
+        return f"{signals.find(s).symbol} error {_format(error, s, signals)}"
+
+    return (f"No effect of the catalogue explains the residual: {describe_error(a.baseline['error'], worst)}, "
+            f"noise floor {_format(floor, worst, signals)}"
+            + (f"; the best, {join_words([*best.beside, best.effect])}, leaves "
+               f"{describe_error(best.error, _find_worst_signal(best.error, floor))}."
+               if best and best.ratio < max(base.ratio.values()) else "."))
 
 
 def _named_candidates(a: Answer) -> list[Candidate]:
@@ -217,9 +222,8 @@ def describe_parameter(name: str, v: Value) -> str:
     return f"{name_parameter(name)} {format_interval(v.value, v.low, v.high, v.unit)}"
 
 
-def _find_worst_signal(a: Answer) -> str:
-    """The signal that the model without further effects explains worst."""
-    error, floor = a.baseline["error"], a.baseline["floor"]
+def _find_worst_signal(error: BySignal, floor: BySignal) -> str:
+    """The signal with the largest error over its floor."""
     return max(error, key=lambda s: error[s] / floor[s] if floor.get(s) else 0.0)
 
 
@@ -228,7 +232,7 @@ def _describe_change(a: Answer, c: Candidate) -> str:
     base = a.explanation.base
     if base.is_at_floor and base.is_far:
         return f"the model explains the run without it {FAR_OFF} ({_describe_furthest(base)})"
-    s, signals = _find_worst_signal(a), find_signals(a)
+    s, signals = _find_worst_signal(a.baseline["error"], a.baseline["floor"]), find_signals(a)
     sentence = _describe_step(s, a.baseline["error"], c.error, a.baseline["floor"], signals)
     return sentence + (f"; held-out run {_format(c.holdout, s, signals)}" if s in c.holdout else "")
 

@@ -262,18 +262,24 @@ def test_of_two_effects_the_one_that_may_be_off_is_left_out() -> None:
     assert [h.effects for h in leave_out_unneeded(search, [both])] == [("null_bias",)]
 
 
-@pytest.mark.parametrize(("is_far", "verdict"), [(False, "EXPLAINED"), (True, "PARTLY")])
-def test_an_explanation_that_needs_tolerances_of_no_healthy_unit_is_doubted(is_far: bool, verdict: str) -> None:
+@pytest.mark.parametrize(("at_floor", "is_far", "xj", "verdict"), [
+    (True, False, 2e-6, "EXPLAINED"), (True, True, 2e-6, "PARTLY"),
+    (False, False, 3e-6, "PARTLY"), (False, False, 10e-6, "UNEXPLAINED")])
+def test_an_explanation_that_needs_tolerances_of_no_healthy_unit_or_spoils_a_signal_is_doubted(
+        at_floor: bool, is_far: bool, xj: float, verdict: str) -> None:
     """A lag of the pilot pressure, which is not in the catalogue, was called a coil lag with clogging, EXPLAINED."""
-    base, best = make_judged((), 9000.0), make_judged(("coil_lag", "filter_clogging"), 1000.0, is_far=is_far)
-    assert decide_verdict(base, [best], [best], True, Marks(1.0, 1e-6, ()), {"xj": 2e-6}) == (
-        verdict, ("coil_lag", "filter_clogging"))
+    base, best = (make_judged((), 9000.0, errors={"xj": 2e-6, "p12": 4e5}), make_judged(
+        ("coil_lag", "filter_clogging"), 1000.0, at_floor, is_far, {"xj": xj, "p12": 4e4}))
+    assert decide_verdict(base, [best], [best], True, Marks(1.0, 1e-6, ()), {"xj": 2e-6, "p12": 2e4}) == (
+        verdict, best.effects if verdict != "UNEXPLAINED" else ())
 
 
-def make_judged(effects: tuple[str, ...], cost: float, at_floor: bool | None = None, is_far: bool = False) -> Any:
+def make_judged(effects: tuple[str, ...], cost: float, at_floor: bool | None = None, is_far: bool = False,
+                errors: Mapping[str, float] = {}) -> Any:
     """As far as `decide_verdict` looks at it; at the floor if it has effects, unless told."""
     return cast(Any, SimpleNamespace(effects=effects, cost=cost, repeat_cost=cost, tolerance_cost=10.0, others=(),
-                                     is_at_floor=bool(effects) if at_floor is None else at_floor, is_far=is_far))
+                                     is_at_floor=bool(effects) if at_floor is None else at_floor, is_far=is_far,
+                                     errors=errors))
 
 
 @pytest.mark.parametrize(("cost", "at_floor", "helps"), [

@@ -480,7 +480,10 @@ CASES = {
         "a together with b or c: each explains the"),
     "PARTLY": (answer("PARTLY", ("a",), candidate("a", word="part")), "a explains part of the residual"),
     "PARTLY by none": (answer("PARTLY", (), candidate("a", word="part")), "No effect of the catalogue"),
-    "UNEXPLAINED": (answer("UNEXPLAINED", (), candidate("a", word="no")), "the best, a, leaves"),
+    "UNEXPLAINED": (answer("UNEXPLAINED", (), candidate("c", word="no")._replace(ratios={"xj": 5.0}),
+                           candidate("a", "b", word="no")), "the best, b and a, leaves XJ error 2.00 um."),
+    "UNEXPLAINED and none better": (answer("UNEXPLAINED", (), candidate("a", word="no")._replace(ratios={"xj": 30.0})),
+                                    "XJ error 45.0 um, noise floor 2.00 um."),
     "UNEXPLAINED without candidates": (answer("UNEXPLAINED", ()), "No effect of the catalogue"),
     "NOT_RESOLVABLE": (answer("NOT_RESOLVABLE", ("a",), candidate("a")), "a may be present"),
 }
