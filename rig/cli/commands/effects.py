@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi.report import Cell, Column, Item, Line, Paragraph, Report, Section, Table, format_digits
-from plant import Report as SelfTest, check_effect, find_effect, find_plant, load_model, load_plant
+from plant import Report as SelfTest, check_effect, find_effect, find_plant, lacks_starts, load_model, load_plant
 from plant.effects import Effect
 from rig.cli import Places, give_answer, load_user_effects, show_progress
 
@@ -58,13 +58,13 @@ def build_effects_report(effects: Sequence[Effect], plant: str, tests: Mapping[s
 
 def describe_effect(e: Effect, plant: str = "eha") -> dict[str, Any]:
     """An effect as JSON values: its law, and its parameters with unit, off value and allowed range."""
-    base = find_plant(plant).nominal
+    base, is_of_another_size = find_plant(plant).nominal, lacks_starts(e, find_plant(plant))
     parameters = {name: {"unit": q.unit, "off": e.off.get(name, base.get(name)), "expected": q.expected,
                          "typical": q.typical, "fitted": name in e.fitted} for name, q in e.parameters.items()}
     return {"effect": e.name, "port": e.port, "in_reference_model": e.base, "in_firmware": e.firmware,
             "law": _name_signals(e.law, plant), "symptoms": _name_signals(e.symptoms, plant),
             "confused_with": list(e.confused_with), "excludes": list(e.excludes), "source": e.source,
-            "parameters": parameters, "starts": [dict(start) for start in e.starts]}
+            "parameters": parameters, "starts": [] if is_of_another_size else [dict(start) for start in e.starts]}
 
 
 def _name_signals(text: str, plant: str) -> str:
@@ -97,7 +97,7 @@ def _list_properties(e: Effect, row: Mapping[str, Any], plant: str) -> list[Item
     return [*(Line(label, text) for label, text in properties if text),
             *(Line("parameter", f"{name}: {'; '.join(words)}") for name, words in parameters),
             *(Line("fits start at", ", ".join(f"{name} = {value:g}" for name, value in start.items()))
-              for start in e.starts)]
+              for start in row["starts"])]
 
 
 def _show_test(test: SelfTest, plant: str) -> Iterator[Item]:

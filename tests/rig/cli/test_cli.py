@@ -177,9 +177,12 @@ def test_an_odd_terminal_and_odd_names_end_no_command(name: str, here: Path) -> 
         "accepts (File name too long)" in refuse("fdi", "x" * 300))
 
 
-def test_the_installed_command_is_this_one() -> None:
-    done = subprocess.run([Path(sys.executable).parent / "rig", "effects", "--json"], capture_output=True, text=True)
-    assert done.returncode == 0 and '"spool_friction"' in done.stdout
+@pytest.mark.parametrize(("words", "text"), [
+    ("effects --json", '"spool_friction"'), ("effects null_bias --json", '"null_bias.current": 3e-05'),
+    ("effects null_bias --model ema --json", '"starts": []')])  # of the size of a servovalve's; others are looked for
+def test_the_installed_command_is_this_one(words: str, text: str) -> None:
+    done = subprocess.run([Path(sys.executable).parent / "rig", *words.split()], capture_output=True, text=True)
+    assert done.returncode == 0 and text in done.stdout
 
 
 @pytest.mark.parametrize(("words", "is_loaded"), [(["list"], False), (["import"], True)])
