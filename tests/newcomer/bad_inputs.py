@@ -136,7 +136,7 @@ BAD_INPUTS = [
     bad("run --set spool.mass=-1", "spool.mass: expected a number"),
     bad("run --bus udp_multicast:10.0.0.1", "IPv4 multicast group"),
     bad("run --bus token-ring", "socketcan:INTERFACE"),
-    bad("run --controller external", "external node"),
+    bad("run --controller external", "a bus between programs"),
     bad("run --controller external --bus udp_multicast:239.0.0.9 --set controller.proportional_gain=1",
         "controller.proportional_gain"),
     bad("run --effects raises.py", "ZeroDivisionError"),
