@@ -266,7 +266,7 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     others = search.map_parallel(lambda h: judge_left_out_rows(search, search.replay_hypothesis(h), floor),
                                  (h for h in level if h.effects not in [c.effects for c in close]))
     parents = [next((p for p in levels[i] if p.effects == close[0].effects[:i]), levels[i][0]) for i in range(1, depth)]
-    if not close and (own := search.hold_own_effects(base)):
+    if not close and (own := search.resize_own_effects(base)):
         base, *close = own
     base, *close = (judge_left_out_rows(search, h, floor) for h in search.judge_on_all([base, *close], FINE))
     ledger = [base, *parents, *close[:1]]

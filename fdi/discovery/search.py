@@ -181,11 +181,12 @@ class Search:
             return first
         return self.retry_from(first, [np.where(np.abs(first.fit.x) > 1.0, 0.0, first.fit.x)])
 
-    def hold_own_effects(self, base: Hypothesis) -> list[Hypothesis]:
-        """A base that leaves only noise as its model has it, and those of its own effects that leave only noise at
-        another size, best first; all of them together where none does alone.
+    def resize_own_effects(self, base: Hypothesis) -> list[Hypothesis]:
+        """The base with the model's sizes of its own effects, then the effects of which another size explains the run.
 
-        [] where the model leaves only noise with its own sizes, or has none to fit.
+        A fit moves these sizes, so a base that leaves only noise may owe that to them. The effects that alone leave
+        only noise at another size come best first; all of them together where none does. [] where the model leaves only
+        noise as it is, or has no effects to fit.
         """
         own = {effect: self.model.find_effect(effect).fitted for effect in list_active_effects(self.model)}
         fitted = {name for names in own.values() for name in names} & {f.name for f in base.fit.free}
@@ -198,9 +199,10 @@ class Search:
             fit = fit_unknowns(self.problem, [f for f, _ in unknowns], np.array([v for _, v in unknowns]))
             return self.finish_hypothesis(self.judge_fit(effects, fit), 2)
 
-        given, *single = self.map_parallel(fit_alone, [(), *((effect,) for effect in own if fitted & {*own[effect]})])
+        given = fit_alone(())
         if given.is_at_floor or given.cost <= base.cost + GAIN_SEEN:
             return []
+        single = self.map_parallel(fit_alone, [(effect,) for effect in own if fitted & {*own[effect]}])
         enough = sorted((h for h in single if h.is_at_floor), key=lambda h: h.cost)
         return [given, *(enough or [replace(base, effects=tuple(own))])]
 
