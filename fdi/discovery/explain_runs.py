@@ -25,6 +25,7 @@ from fdi.estimation import (
     complete_model,
     cut_excerpt,
     limit_friction_values,
+    list_active_effects,
     make_excerpt,
     silence_readings,
 )
@@ -258,6 +259,12 @@ def assess_explanation(e: Explanation, seed: int) -> Answer:
     suspicious = tuple(list_suspicious(best.fit, model.plant)) if is_telling else ()
     return Answer(e, tuple(_list_candidates(e, seed)), baseline, e.hidden, noiseless, suspicious,
                   tuple(_list_ledger(e, firmware_prints)))
+
+
+def list_own_candidates(a: Answer) -> list[Candidate]:
+    """The named effects that the model has already, at another size."""
+    return [c for c in a.candidates if c.effect in a.explanation.effects
+            and c.effect in list_active_effects(a.explanation.search.model)]
 
 
 def list_fitted_parameters(effect: str, fit: Fit, model: Model) -> dict[str, Value]:

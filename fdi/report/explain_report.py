@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fdi.comparison.compare import compare_controller
-from fdi.discovery.explain_runs import Answer, Candidate, Suspicious, list_shared_effects
+from fdi.discovery.explain_runs import Answer, Candidate, Suspicious, list_own_candidates, list_shared_effects
 from fdi.discovery.laws.find_law import Law, LawCurve, LawSearch, Missing
 from fdi.discovery.laws.terms import describe_formula
 from fdi.discovery.residual_pattern import Pattern, find_smooth_rows
@@ -18,7 +18,7 @@ from fdi.discovery.runs import Source
 from fdi.discovery.search import Hypothesis
 from fdi.discovery.sensitivity import NEEDED, RUNGS, TRIALS, Claim
 from fdi.discovery.update_model import ModelUpdate, Row
-from fdi.estimation import Value, list_active_effects
+from fdi.estimation import Value
 from fdi.report.compare_report import OTHER_ACTUATOR, describe_gains
 from fdi.report.drawing import (
     AFTER,
@@ -173,8 +173,8 @@ def describe_verdict(a: Answer) -> str:
     rest = f"{_describe_sizes(candidates)}; {_describe_change(a, candidates[-1])}."
     if a.verdict == "EXPLAINED":
         model = a.explanation.search.model
-        own = [f"{name_parameter(name)} {format_amount(model[name], v.unit)}" for c in candidates
-               if c.effect in list_active_effects(model) for name, v in c.parameters.items()]
+        own = [f"{name_parameter(name)} {format_amount(model[name], v.unit)}" for c in list_own_candidates(a)
+               for name, v in c.parameters.items()]
         has = f" The model has it with {join_words(own)}." if own else ""
         return f"{words} {'together ' if len(candidates) > 1 else ''}{verb} the residual: {rest}{has}"
     if a.best.is_at_floor and a.best.is_far:

@@ -5,11 +5,10 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from fdi.discovery.explain_runs import Answer, explain_runs, list_shared_effects
+from fdi.discovery.explain_runs import Answer, explain_runs, list_own_candidates, list_shared_effects
 from fdi.discovery.residual_pattern import can_balance
 from fdi.discovery.runs import Runs, read_runs
 from fdi.discovery.sensitivity import Claim, describe_unit
-from fdi.estimation import list_active_effects
 from fdi.progress import Progress
 from fdi.report import build_explanation_report
 from plant import require
@@ -83,9 +82,7 @@ def choose_next_command(args: argparse.Namespace, answer: Answer, effect_file: s
             return f"rig explain {arguments} --write-effect missing.py"
         both = (*answer.law.base.effects, *answer.law_effects)
         return f"rig add {' '.join(both)} {arguments} --effects {effect_file}"
-    own = list_active_effects(answer.explanation.search.model)
-    values = {name: f"{name}={v.value:.6g}" for c in answer.candidates if c.effect in {*own} & {*effects}
-              for name, v in c.parameters.items()}
+    values = {name: f"{name}={v.value:.6g}" for c in list_own_candidates(answer) for name, v in c.parameters.items()}
     if values:
         settings = [*(each for each in args.set or () if each.split("=")[0] not in values), *values.values()]
         return f"rig explain {format_arguments(argparse.Namespace(**vars(args) | {'set': settings}))}"

@@ -68,14 +68,15 @@ def write_samples(args: argparse.Namespace) -> int:
     other = build_profile((Points(points=SAMPLE_POINTS),)).command
     runs = {"run.csv": usual, "run2.csv": usual, "held.csv": other}
     places = {name: require_new(folder / name, is_forced=args.force) for name in runs}
+    steps = args.steps or 400  # a cycle: finer than those of a fit, as a real unit is
     for seed, (name, com) in enumerate(runs.items(), args.seed + 1):
-        # steps a cycle finer than those of a fit, as a real unit is
-        columns = simulate(model, com, load[:len(com)], seed, args.steps or 400)
+        columns = simulate(model, com, load[:len(com)], seed, steps)
         Trace.from_columns(columns._asdict(), period, {"seed": str(seed)},
                            model.kind.signals).write_csv(places[name])
-    return give_answer(Report("simulate", "samples", data={"traces": [*map(str, places.values())]}, sentence=(
-        f"{', '.join(map(str, places.values()))}: a run, its repeat, and a run of another command. Next: "
-        f"rig compare {places['run.csv']} --repeat {places['run2.csv']}")), args)
+    sentence = (f"{', '.join(map(str, places.values()))}: a run, its repeat, and a run of another command. Next: "
+                f"rig compare {places['run.csv']} --repeat {places['run2.csv']}")
+    return give_answer(Report("simulate", "samples", sentence=sentence,
+                              data={"traces": [str(place) for place in places.values()]}), args)
 
 
 def load_command(file: str | None, period: float, kind: Plant) -> tuple[Any, Any, str]:
