@@ -18,10 +18,11 @@ import shutil
 import stat
 import tempfile
 from collections import namedtuple
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial, reduce
 from itertools import takewhile
+from operator import getitem
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any, TypeVar
@@ -34,8 +35,16 @@ Function = Any  # a plain function, or numba's dispatcher of one
 AnyFunction = TypeVar("AnyFunction", bound=Callable[..., Any])
 
 
+class CompiledCall:
+    """A call that compiled code has instructions of its own for; its content is its fingerprint."""
+
+    def declare(self) -> Any:
+        """What numba compiles into the call."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
-class ForeignCall:
+class ForeignCall(CompiledCall):
     """A call of machine code that is not ours, for compiled code: of a function of the C library, or by address.
 
     Code that calls the library by name can be stored on disk, which is not so for a function pointer of ctypes. A loop
@@ -71,6 +80,127 @@ class ForeignCall:
         exec(f"def call_{self.signature}(context, address, {names}):\n    return type_call((address, {names}))",
              namespace)
         return numba.extending.intrinsic(namespace[f"call_{self.signature}"])
+
+
+@dataclass(frozen=True, eq=False)
+class ReadRecord(CompiledCall):
+    """`(array, place) -> record` of type `kind`: float i is number (first + i) * apart + place of the array.
+
+    The record is a copy, which the compiler keeps in registers; laws get its address. Rejected alternatives: a tuple of
+    two hundred numbers passed to each law doubles the time to compile; with the address in the array itself the
+    compiler turns a choice of two numbers into a choice of two addresses, and then makes no vector code.
+    """
+
+    kind: np.dtype[Any]
+    first: int
+    apart: int
+
+    def declare(self) -> Any:
+        """What numba compiles into the call."""
+        import numba.core.cgutils
+        import numba.extending
+
+        record, count = numba.from_dtype(self.kind), self.kind.itemsize // np.dtype(float).itemsize
+
+        def read(typing: Any, array: Any, place: Any) -> Any:
+            def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                point_at = _make_pointer(context, builder, signature.args, values, self.apart)
+                number = context.get_value_type(numba.float64)
+                copy = numba.core.cgutils.alloca_once(builder, number, count)  # type: ignore[no-untyped-call]
+                for i in range(count):
+                    there = builder.gep(copy, [context.get_constant(numba.intp, i)])
+                    builder.store(builder.load(point_at(self.first + i)), there)
+                return builder.bitcast(copy, context.get_value_type(record))
+
+            return record(array, place), code
+
+        return numba.extending.intrinsic(read)
+
+
+@dataclass(frozen=True, eq=False)
+class KeepTuple(CompiledCall):
+    """`(x, array, place)`: puts the numbers of a tuple into an array.
+
+    `places` is a tuple like `x` that says which number of the array each one is, and -1 for one that is not kept;
+    number i is at i * apart + place. Written out as Python, such calls took a quarter of the time to compile a kernel.
+    """
+
+    places: Any
+    apart: int = 1
+
+    def __call__(self, x: Any, array: Any, place: int) -> None:
+        """The same in plain Python."""
+        for path, number in list_kept_numbers(self.places):
+            array[number * self.apart + place] = reduce(getitem, path, x)
+
+    def declare(self) -> Any:
+        """What numba compiles into the call."""
+        import numba.extending
+
+        def keep(typing: Any, x: Any, array: Any, place: Any) -> Any:
+            def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                point_at = _make_pointer(context, builder, signature.args[1:], values[1:], self.apart)
+                for path, number in list_kept_numbers(self.places):
+                    value = builder.extract_value(values[0], path) if path else values[0]
+                    kind = reduce(getitem, path, x)
+                    builder.store(context.cast(builder, value, kind, numba.float64), point_at(number))
+                return context.get_dummy_value()
+
+            return numba.void(x, array, place), code
+
+        return numba.extending.intrinsic(keep)
+
+
+@dataclass(frozen=True, eq=False)
+class LoadTuple(CompiledCall):
+    """`(array, place) -> x`: the tuple that `KeepTuple` has put there; what is not kept is 0.0."""
+
+    places: Any
+    apart: int = 1
+
+    def __call__(self, array: Any, place: int) -> Any:
+        """The same in plain Python."""
+        return map_numbers(lambda number: 0.0 if number < 0 else array[number * self.apart + place], self.places)
+
+    def declare(self) -> Any:
+        """What numba compiles into the call."""
+        import numba.extending
+
+        kind = numba.typeof(map_numbers(float, self.places))  # type: ignore[no-untyped-call]
+
+        def load(typing: Any, array: Any, place: Any) -> Any:
+            def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                point_at = _make_pointer(context, builder, signature.args, values, self.apart)
+                x = context.get_constant_null(kind)
+                for path, number in list_kept_numbers(self.places):
+                    value = builder.load(point_at(number))
+                    x = builder.insert_value(x, value, path) if path else value
+                return x
+
+            return kind(array, place), code
+
+        return numba.extending.intrinsic(load)
+
+
+def map_numbers(change: Callable[[Any], Any], x: Any) -> Any:
+    """A tuple like `x`, which may be nested, of its numbers as `change` makes them. A number is one itself."""
+    if not isinstance(x, tuple):
+        return change(x)
+    parts = [map_numbers(change, part) for part in x]
+    return type(x)(*parts) if hasattr(x, "_fields") else tuple(parts)
+
+
+def list_kept_numbers(places: Any, path: tuple[int, ...] = ()) -> list[tuple[tuple[int, ...], int]]:
+    """The indices that lead to each number of nested tuples, and the number, without those below 0."""
+    if not isinstance(places, tuple):
+        return [(path, places)] if places >= 0 else []
+    return [kept for i, part in enumerate(places) for kept in list_kept_numbers(part, (*path, i))]
+
+
+def _make_pointer(context: Any, builder: Any, kinds: Any, values: Any, apart: int) -> Callable[[int], Any]:
+    """`point_at(number)`: address of number * apart + place in an array of floats; `values` are the array and place."""
+    data = context.make_array(kinds[0])(context, builder, values[0]).data
+    return lambda number: builder.gep(data, [builder.add(values[1], context.get_constant(kinds[1], number * apart))])
 
 
 # numpy's tables of the ziggurat of the normal distribution: 256 layers, and where the tail begins
@@ -128,13 +258,18 @@ def interpret_function(function: Function, ports: Mapping[str, Function] | None 
     return _link_calls(function, ports or {}, lambda f: f)
 
 
-def compile_function(function: Function, ports: Mapping[str, Function] | None = None) -> Function:
-    """`function` and all functions that it calls, with `ports` bound, as machine code that is cached on disk."""
+def compile_function(function: Function, ports: Mapping[str, Function] | None = None, family: Hashable = None
+                     ) -> Function:
+    """`function` and all functions that it calls, with `ports` bound, as machine code that is cached on disk.
+
+    In a process numba types and translates a function only once for all kernels of a `family`. Those that take other
+    records of parameters are no family: numba takes a record for another one that begins with its fields, and warns.
+    """
     import numba.core.compiler_lock  # here and below: who only reads a trace need not load it, which takes 0.3 s
 
     _let_lanes_fill_registers()
     root = _link_calls(function, ports or {}, lambda f: f)
-    linked_root = _link_calls(function, ports or {}, _declare_part, lambda call: call.declare())
+    linked_root = _link_calls(function, ports or {}, partial(_declare_part_once, family), _declare_call_once)
     settings: Any = numba.config
     folder = _find_folder_of_code(root)
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
@@ -213,6 +348,28 @@ def raise_unbound(*arguments: Any) -> Any:
     raise TypeError("no function is bound")
 
 
+_PARTS: dict[Hashable, Function] = {}  # of this process, by what they consist of
+
+
+def _declare_part_once(family: Hashable, f: Function) -> Function:
+    """The part that was declared for an equal function of the family before, else a new one.
+
+    Equal are functions of the same code that name the same objects; a part keeps these, so their addresses stay theirs.
+    """
+    cells = [cell.cell_contents for cell in f.__closure__ or ()]
+    named = _find_globals(f)
+    parts = *(f.__defaults__ or ()), *cells, *named.values()
+    key = family, f.__code__, vars(f).get("is_apart", False), *named, *map(id, parts)
+    if key not in _PARTS:
+        _PARTS[key] = _declare_part(f)
+    return _PARTS[key]
+
+
+@cache
+def _declare_call_once(call: CompiledCall) -> Any:
+    return call.declare()
+
+
 def _declare_part(f: Function) -> Function:
     """A function below the one to be compiled, as numba gets it.
 
@@ -261,56 +418,25 @@ def _make_part_compiler() -> Any:
 
 
 def _link_calls(function: Function, ports: Mapping[str, Function], make: Callable[[Function], Function],
-                declare: Callable[[ForeignCall], Any] = lambda call: call) -> Function:
+                declare: Callable[[CompiledCall], Any] = lambda call: call) -> Function:
     """Copy the call graph below `function`; functions marked by `bind_later` are replaced by those of `ports`.
 
-    Each copy goes through `make`, each function of the C library through `declare`.
+    Each copy goes through `make`, each call with instructions of its own through `declare`.
     """
     copies: dict[Function, Function] = {}
 
     def link(f: Function) -> Function:
         f = getattr(f, "py_func", f)  # an @njit function is welcome too
         if not isinstance(f, FunctionType):
-            return f
+            return declare(f) if isinstance(f, CompiledCall) else f
         if f not in copies:
             calls = {name: link(ports.get(name, g) if "is_bound_later" in vars(g) else g)
                      for name, g in _find_calls(f).items()}
-            external = {name: declare(g) for name, g in _find_globals(f).items() if isinstance(g, ForeignCall)}
+            external = {name: declare(g) for name, g in _find_globals(f).items() if isinstance(g, CompiledCall)}
             copies[f] = make(rebind_names(f, **calls, **external, **_copy_libraries(f, link)))
         return copies[f]
 
     return link(function)
-
-
-def make_record_reader(kind: np.dtype[Any], first: int, apart: int) -> Function:
-    """A function for compiled code: `(array, place) -> record` of type `kind`; float i is at first + i * apart + place.
-
-    The record is a copy, which the compiler keeps in registers; laws get its address. Rejected alternatives: a tuple of
-    two hundred numbers passed to each law doubles the time to compile; with the address in the array itself the
-    compiler turns a choice of two numbers into a choice of two addresses, and then makes no vector code.
-    """
-    import numba.core.cgutils
-    import numba.extending
-
-    record = numba.from_dtype(kind)
-
-    def at(typing: Any, array: Any, place: Any) -> Any:
-        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            data = context.make_array(signature.args[0])(context, builder, values[0]).data
-            number = data.type.pointee
-            count = context.get_constant(signature.args[1], kind.itemsize // np.dtype(float).itemsize)
-            copy = numba.core.cgutils.alloca_once(builder, number, count)  # type: ignore[no-untyped-call]
-            for i in range(count.constant):
-                there = builder.add(values[1], context.get_constant(signature.args[1], first + i * apart))
-                builder.store(builder.load(builder.gep(data, [there])),
-                              builder.gep(copy, [context.get_constant(signature.args[1], i)]))
-            return builder.bitcast(copy, context.get_value_type(record))
-
-        return record(array, place), code
-
-    # `compute_fingerprint` tells readers apart by their name
-    at.__name__ = "record_" + hashlib.sha256(f"{kind!r} {first} {apart}".encode()).hexdigest()[:20]
-    return numba.extending.intrinsic(at)
 
 
 def _find_globals(function: Function) -> dict[str, Any]:
@@ -360,9 +486,15 @@ def _copy_libraries(function: Function, link: Callable[[Function], Function]) ->
             members = {f: vars(library).get(f) for f in function.__code__.co_names}
             replacements = {f: link(_find_own_version(g)) for f, g in members.items() if _find_own_version(g) is not g}
             if replacements:
-                copies[name] = ModuleType(library.__name__)
-                copies[name].__dict__.update(vars(library) | replacements)
+                copies[name] = _copy_library(library, tuple(replacements.items()))
     return copies
+
+
+@cache
+def _copy_library(library: ModuleType, replacements: tuple[tuple[str, Function], ...]) -> ModuleType:
+    copy = ModuleType(library.__name__)
+    copy.__dict__.update(vars(library) | dict(replacements))
+    return copy
 
 
 def compute_fingerprint(function: Function) -> str:

@@ -80,7 +80,7 @@ def run_flow_balance(flat: Any, rows: Any, position: float, record: Any, steps: 
     p = record[0]
     h = p.controller.period / steps
     constant = compute_coefficients(p, h)
-    s, m = unpack_state(flat)
+    s, m = unpack_state(flat, 0)
     s, m = rest_at_reading(s, m, position, p, steps)
     for k in range(len(rows)):
         ahead = min(k + 1, len(rows) - 1)
@@ -105,7 +105,7 @@ def run_force_balance(flat: Any, motion: Any, record: Any, steps: int, out: Any)
     g = p.jack
     h = p.controller.period / steps
     constant = compute_coefficients(p, h)
-    m = unpack_state(flat)[1]
+    m = unpack_state(flat, 0)[1]
     for k in range(len(motion)):
         x, v, rate, p12, load = motion[k, 0], motion[k, 1], motion[k, 2], motion[k, 3], motion[k, 4]
         for i in range(steps):

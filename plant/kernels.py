@@ -6,12 +6,12 @@ uses, and a flat array of floats, which stores them (the state of a model with e
 assignments compiled code moves numbers between registers and the buffer and nothing else.
 """
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from plant.compile import Function, raise_unbound
+from plant.compile import Function, KeepTuple, LoadTuple, raise_unbound
 from plant.signals import Signals
-from plant.state import Memory
 
 step_plant = measure_plant = sense_plant = move_plant = correct_plant = invert_plant = shift_memories = raise_unbound
 compute_plant_coefficients = start_control = control_plant = load_control = store_control = raise_unbound
@@ -86,30 +86,24 @@ def write_function(name: str, arguments: str, lines: Sequence[str], **known: Any
     return known[name]
 
 
-def make_packers(shape: Any, first: int = 0) -> tuple[Function, Function]:
-    """Functions `pack(x, array)` and `unpack(array) -> x` for tuples like `shape`, such as a state with its memories.
+def make_packers(shape: Any, apart: int = 1, first: int = 0) -> tuple[KeepTuple, LoadTuple, int]:
+    """Calls `keep(x, array, place)` and `load(array, place) -> x` for tuples like `shape`, and the next free number.
 
-    The numbers of `shape` begin with number `first` of the array.
+    Such a tuple is a state with its memories. Its numbers begin with number `first`; number i of the array is at
+    i * apart + place, where `apart` is the count of lanes and `place` the lane, 0 in a single run.
     """
-    pack, unpack, _ = _make_converters(shape, "", lambda i: f"a[{first + i}]")
-    return pack, unpack
+    numbers = itertools.count(first)
+    places = _number_places(shape, numbers)
+    return KeepTuple(places, apart), LoadTuple(places, apart), next(numbers)
 
 
-def make_lane_packers(shape: Any, width: int, first: int) -> tuple[Function, Function, int]:
-    """Functions `keep(x, array, lane)` and `at(array, lane) -> x` for tuples like `shape`, and the next free number.
-
-    Number f of a lane is at f * width + lane of the buffer; the numbers of `shape` begin with f = `first`.
-    """
-    keep, at, numbers = _make_converters(shape, ", lane", lambda i: f"a[{(first + i) * width} + lane]")
-    return keep, at, first + numbers
-
-
-def _make_converters(shape: Any, lane: str, place: Callable[[int], str]) -> tuple[Function, Function, int]:
-    kinds: dict[str, type[Any]] = {}
-    paths: list[str] = []
-    built = _build_expression(shape, "s", kinds, paths, place)
-    keep = write_function("keep", f"s, a{lane}", [f"{place(i)} = {path}" for i, path in enumerate(paths)])
-    return keep, write_function("at", f"a{lane}", [f"return {built}"], **kinds), len(paths)
+def _number_places(x: Any, numbers: Iterator[int]) -> Any:
+    """The tuple `x` with the number of its place in an array for each float, -1 for one that is not kept."""
+    if not isinstance(x, tuple):
+        return next(numbers)
+    places: Iterator[Any] = (-1 if _is_bare(x) and not isinstance(part, tuple) else _number_places(part, numbers)
+                             for part in x)
+    return type(x)(*places) if hasattr(x, "_fields") else tuple(places)
 
 
 def list_state_values(start: Any) -> list[float]:
@@ -124,23 +118,5 @@ def _is_bare(x: tuple[Any, ...]) -> bool:
     return hasattr(x, "holds_memories") or not hasattr(x, "_fields")
 
 
-def _build_expression(x: Memory, path: str, kinds: dict[str, type[Any]], paths: list[str],
-                      place: Callable[[int], str]) -> str:
-    """The expression that builds `x` from the array `a`; notes the tuple types it needs and the path to each number."""
-    if not isinstance(x, tuple):
-        paths.append(path)
-        return place(len(paths) - 1)
-    named = getattr(x, "_fields", None)
-    parts = [(part, f"{path}.{named[i]}" if named else f"{path}[{i}]") for i, part in enumerate(x)]
-    bare = _is_bare(x)
-    inner = ["0.0" if bare and not isinstance(part, tuple) else _build_expression(part, p, kinds, paths, place)
-             for part, p in parts]
-    if not named:
-        return f"({', '.join(inner)},)"
-    kind = f"T{len(kinds)}"
-    kinds[kind] = type(x)
-    return f"{kind}({', '.join(inner)})"
-
-
-# each model binds its own: pack_state((state, memories), array), and unpack_state(array) -> (state, memories)
+# each model binds its own: pack_state((state, memories), array, 0), and unpack_state(array, 0) -> (state, memories)
 pack_state = unpack_state = raise_unbound

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from plant.compile import (
     Function,
+    ReadRecord,
     compile_function,
     is_costly,
     is_function_stored,
-    make_record_reader,
     raise_unbound,
     rebind_names,
 )
@@ -34,7 +34,7 @@ from plant.kernels import (
     control_plant,
     keep_answer,
     keep_sample,
-    make_lane_packers,
+    make_packers,
     measure_plant,
     start_control,
     step_plant,
@@ -384,9 +384,10 @@ class KernelVariant:
     def __init__(self, model: Model, effects: tuple[str, ...]) -> None:
         own = set(build_bare_model(model.plant).with_effects(effects).values)
         self.model = replace(model, effects=effects, values={n: v for n, v in model.values.items() if n in own})
-        self._names, self._laws = self.model.list_names(), model.kind.list_laws(effects)
+        self._laws = model.kind.list_laws(effects)
         self._state: Array | None = None
-        self._parameters = self.model.build_record().view(np.float64)[:, None]
+        complete = self.model.with_effects(e.name for e in model.kind.list_effects() if _is_shipped(e))
+        self._names, self._record = complete.list_names(), complete.build_record()
         # lanes of its blocks: a costly effect keeps the processor busy with one register, else a step is half waiting;
         # a model of few effects makes too few runs to be worth the seconds in which a second layout is compiled
         is_waiting = all(_is_cheap(model.find_effect(name)) for name in effects)
@@ -396,7 +397,7 @@ class KernelVariant:
     def is_ready(self, steps: float) -> bool:
         """Whether the kernel can make so many steps of all lanes now: see `KernelUse.is_ready`."""
         def is_stored() -> bool:
-            plan = plan_layout(self.model.effects, self.model.kind, self.widths[0])
+            plan = plan_layout(self.model.effects, self.model.kind, self._record.dtype, self.widths[0])
             return is_function_stored(plan.loop, plan.names)
 
         return KERNEL_USE.is_ready(self.key, steps, is_stored, self.prepare)
@@ -404,7 +405,7 @@ class KernelVariant:
     @property
     def key(self) -> Hashable:
         """What tells the kernel from others: one kernel makes the runs of models that differ in parameters alone."""
-        return self.model.kind, self.model.effects, self._laws
+        return self.model.kind, self.model.effects, self._laws, self._record.dtype
 
     def prepare(self) -> None:
         """Load or compile the kernel by a run of no samples."""
@@ -417,16 +418,19 @@ class KernelVariant:
 
     def compile(self, width: int) -> Function:
         """The kernel with so many lanes."""
-        return _compile_layout(self.model.effects, self._laws, self.model.kind, width)[1]
+        return self._compile_layout(width)[1]
+
+    def _compile_layout(self, width: int) -> tuple[Layout, Function]:
+        return _compile_layout(self.model.effects, self._laws, self.model.kind, self._record.dtype, width)
 
     def fill_lanes(self, names: Sequence[str], values: Array) -> Array:
         """The numbers of a lane for each run, (numbers, m), whose named parameters are `values` (m, p)."""
-        plan, _ = _compile_layout(self.model.effects, self._laws, self.model.kind, self.widths[0])
+        plan, _ = self._compile_layout(self.widths[0])
         if self._state is None:  # not sooner: it asks laws, which may be wrong
             self._state = self.model.build_flat_state()
         lanes = np.zeros((plan.numbers, len(values)))
         lanes[:len(self._state)] = self._state[:, None]
-        lanes[plan.parameters:] = self._parameters
+        lanes[plan.parameters:] = self._record.view(np.float64)[:, None]
         for column, name in enumerate(names):
             if name in self._names:
                 lanes[plan.parameters + self._names.index(name)] = values[:, column]
@@ -455,7 +459,7 @@ def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambd
     """Compile the kernels that runs of the model may need, or load them from the cache.
 
     `progress` is called with each stage and the share done.
-    The first time this takes some 3 s without effects and 15 s with the whole catalogue, later half a second.
+    The first time this takes some 2 s without effects and 15 s with the whole catalogue, later half a second.
     """
     variants = list_kernel_variants(model)
     for done, variant in enumerate(variants):
@@ -465,19 +469,21 @@ def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambd
     progress("", 1.0)
 
 
+def _is_shipped(effect: Effect) -> bool:
+    return effect.function is not None and effect.function.__module__.startswith("plant.")
+
+
 def _is_cheap(effect: Effect) -> bool:
     """Whether a law of ours neither divides nor calls elementary functions, nor changes the oil, which does both."""
-    if effect.port in ("supply", "viscosity") or effect.function is None:
-        return False
-    return effect.function.__module__.startswith("plant.") and not is_costly(effect.function)
+    return effect.port not in ("supply", "viscosity") and _is_shipped(effect) and not is_costly(effect.function)
 
 
 @cache
-def _compile_layout(effects: tuple[str, ...], laws: tuple[Any, ...], kind: Plant, width: int
+def _compile_layout(effects: tuple[str, ...], laws: tuple[Any, ...], kind: Plant, record: np.dtype[Any], width: int
                     ) -> tuple[Layout, Function]:
     # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
-    plan = plan_layout(effects, kind, width)
-    return plan, compile_function(plan.loop, plan.names)
+    plan = plan_layout(effects, kind, record, width)
+    return plan, compile_function(plan.loop, plan.names, record)
 
 
 class Layout(NamedTuple):
@@ -501,16 +507,17 @@ state_at = parameters_at = coefficients_at = loop_at = drive_at = raise_unbound
 keep_state = keep_coefficients = keep_loop = keep_drive = raise_unbound
 
 
-def plan_layout(effects: tuple[str, ...], kind: Plant, width: int = NARROW) -> Layout:
-    """The layout for a plant with `effects`, `width` lanes."""
+def plan_layout(effects: tuple[str, ...], kind: Plant, record: np.dtype[Any], width: int = NARROW) -> Layout:
+    """The layout for a plant with `effects` and parameters in a `record`, `width` lanes."""
     functions, place = kind.bind_functions(effects), 0
-    record = build_bare_model(kind.key).with_effects(effects).build_record()
+    p = build_bare_model(kind.key).with_effects(effects).build_record()[0]
     shapes = {"state": kind.build_start(effects), "loop": kind.build_control_memory(), "drive": Drive(),
-              "coefficients": functions["compute_plant_coefficients"](record[0], 1.0)}
+              "coefficients": functions["compute_plant_coefficients"](p, 1.0)}
     for name, shape in shapes.items():
-        functions[f"keep_{name}"], functions[f"{name}_at"], place = make_lane_packers(shape, width, place)
-    functions["parameters_at"] = make_record_reader(record.dtype, place * width, width)
-    return Layout(rebind_names(run_block, WIDTH=width), functions, place, place + record.view(float).size)
+        functions[f"keep_{name}"], functions[f"{name}_at"], place = make_packers(shape, width, place)
+    functions["parameters_at"] = ReadRecord(record, place, width)
+    numbers = place + record.itemsize // np.dtype(float).itemsize
+    return Layout(rebind_names(run_block, WIDTH=width), functions, place, numbers)
 
 
 def run_block(a: Any, com: Any, load: Any, position: Any, anchor: float, slack: float, is_closed: bool, period: float,

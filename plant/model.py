@@ -108,6 +108,12 @@ class Model:
         check_exclusions(where, model, all_values)
         return replace(model, values=all_values)
 
+    def require_acting_load(self, load: NDArray[np.float64] | None, where: object) -> None:
+        """Refuse a load, (n,), that acts through effects alone of which the model has none. Raises InputError."""
+        changes = [f"--set {self.find_effect(name).fitted[0]}=1" for name in self.kind.loaded_by]
+        is_loaded = load is not None and load.any() and changes and not {*self.kind.loaded_by} & {*self.effects}
+        require(not is_loaded, where, "load", f"0, or a model in which it acts: {' or '.join(changes)}")
+
     def with_effects(self, groups: Iterable[str]) -> Self:
         """The model with the effects among `groups` added at their off values."""
         names = set(groups) | set(self.effects)
@@ -302,5 +308,6 @@ def build_kernel(function: Function, effects: tuple[str, ...], fast: bool = True
 @cache
 def _build_kernel(function: Function, effects: tuple[str, ...], laws: tuple[Any, ...], fast: bool, kind: Plant
                   ) -> Function:
-    # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
-    return (compile_function if fast else interpret_function)(function, kind.bind_functions(effects))
+    # `laws` is part of keys only: a user may load a changed file under the same effect names
+    ports = kind.bind_functions(effects)
+    return compile_function(function, ports, (kind, laws)) if fast else interpret_function(function, ports)

@@ -20,7 +20,7 @@ import numpy as np
 from plant.compile import Function, compile_function, raise_unbound
 from plant.errors import require
 from plant.friction import clip, soften
-from plant.kernels import make_lane_packers
+from plant.kernels import make_packers
 from plant.lanes import Drive
 from plant.model import Model
 from plant.parameters import Controller
@@ -198,9 +198,10 @@ STATES = 9  # numbers of the first three
 @cache
 def compile_monitor_kernel() -> Function:
     """`run_monitor_block` as machine code; the first call on a machine takes some seconds."""
-    packers, place = {}, 0
+    packers: dict[str, Function] = {}
+    place = 0
     for name, shape in PARTS.items():
-        packers[f"keep_{name}"], packers[f"{name}_at"], place = make_lane_packers(shape, WIDTH, place)
+        packers[f"keep_{name}"], packers[f"{name}_at"], place = make_packers(shape, WIDTH, place)
     return compile_function(run_monitor_block, packers)
 
 

@@ -263,7 +263,7 @@ class Plant:
         shifts = {name: [e.shift for e in effects if e.port == name] for name in self.ports}
         functions["shift_memories"] = bind_shifts(
             ((name, chain_shifts(own)) for name, own in shifts.items() if any(own)), self.memory)
-        functions["pack_state"], functions["unpack_state"] = make_packers(self.build_start(names))
+        functions["pack_state"], functions["unpack_state"], _ = make_packers(self.build_start(names))
         acting_at = {e.port for e in effects}
         return functions | {name: f for name, (f, ports) in self.variants.items() if not ports or ports & acting_at}
 
@@ -296,7 +296,7 @@ class Plant:
         step = self.step
         if len(inspect.signature(step).parameters) == 4:
             step = write_function("step_plant", "s, m, u, p, k", ["return step(s, m, u, p)"], step=step)
-        store, load = make_packers(self.build_control_memory(), CONTROL_AT)
+        store, load, _ = make_packers(self.build_control_memory(), first=CONTROL_AT)
         return {"step_plant": step, "store_control": store, "load_control": load,
                 "measure_plant": self.measure, "move_plant": self.move, "correct_plant": self.correct or self.move,
                 "invert_plant": self.inverse or raise_unbound,

@@ -269,12 +269,12 @@ class Actuator:
     @property
     def state(self) -> Any:
         """The present state of the plant."""
-        return self._unpack(self._flat.tolist())[0]
+        return self._unpack(self._flat.tolist(), 0)[0]
 
     @property
     def memory(self) -> Any:
         """What the effects remember now, by port."""
-        return self._unpack(self._flat.tolist())[1]
+        return self._unpack(self._flat.tolist(), 0)[1]
 
     def warm(self) -> None:
         """Compile now, so that the first cycle is not late.

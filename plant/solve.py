@@ -52,9 +52,9 @@ def read_controlled(y: Any, s: Any, m: Memory, noise: float, t: float, p: Any) -
 
 def read_flat_sensors(flat: Any, noise: Any, t: float, record: Any) -> Any:
     """`read_sensors` on a flat state, which keeps the memories."""
-    s, m = unpack_state(flat)
+    s, m = unpack_state(flat, 0)
     y, m = read_sensors(s, m, noise, t, record[0])
-    pack_state((s, m), flat)
+    pack_state((s, m), flat, 0)
     return y
 
 
@@ -71,8 +71,8 @@ def step_cycle(s: Any, m: Memory, drive: float, load: float, noise: float, t: fl
 
 def advance_flat_state(flat: Any, drive: float, load: float, noise: float, t: float, record: Any, steps: int) -> None:
     """`step_cycle` in place on a flat state: passing tuples to Python and back costs twice as much as the physics."""
-    s, m = unpack_state(flat)
-    pack_state(step_cycle(s, m, drive, load, noise, t, record, steps), flat)
+    s, m = unpack_state(flat, 0)
+    pack_state(step_cycle(s, m, drive, load, noise, t, record, steps), flat, 0)
 
 
 def run_closed_loop(flat: Any, com: Any, load: Any, noise: Any, record: Any, steps: int, out: Any) -> None:
@@ -88,7 +88,7 @@ def run_closed_loop(flat: Any, com: Any, load: Any, noise: Any, record: Any, ste
         out: (n, columns), written: readings and drive in the order of `Signals.columns`.
     """
     p = record[0]
-    s, m = unpack_state(flat)
+    s, m = unpack_state(flat, 0)
     c = start_control()
     drive = 0.0
     for k in range(len(com)):
@@ -99,7 +99,7 @@ def run_closed_loop(flat: Any, com: Any, load: Any, noise: Any, record: Any, ste
         keep_row(y, answer, out, k)
         s, m = step_cycle(s, m, drive, load[k], noise[k, len(y)], t, record, steps)
         drive = answer
-    pack_state((s, m), flat)
+    pack_state((s, m), flat, 0)
 
 
 def run_controller(flat: Any, control: Any, com: Any, readings: Any, record: Any, out: Any) -> None:
@@ -114,8 +114,8 @@ def run_controller(flat: Any, control: Any, com: Any, readings: Any, record: Any
         out: (n,), written.
     """
     p = record[0]
-    m = unpack_state(flat)[1]
-    c = load_control(control)
+    m = unpack_state(flat, 0)[1]
+    c = load_control(control, 0)
     for k in range(len(com)):
         y = get_readings(readings, k)
         demand, m = take_demand(com[k], m, y[0], k * p.controller.period, p)

@@ -36,7 +36,7 @@ def advance_unit(flat: Any, loop: Any, inputs: Any, noise: Any, record: Any, ste
         out: (outputs + 1,) readings at the end, and the controller's answer; holds those at the start.
     """
     p = record[0]
-    s, m = unpack_state(flat)
+    s, m = unpack_state(flat, 0)
     if loop[CYCLES] < 0.0:
         s = show_start(s, m, p)
     else:
@@ -46,11 +46,11 @@ def advance_unit(flat: Any, loop: Any, inputs: Any, noise: Any, record: Any, ste
             drive = loop[ANSWER]
             y = load_readings(out)
             demand, m = take_demand(inputs[0], m, y[0], t, p)
-            loop[ANSWER], c = control_plant(load_control(loop), demand, y, p)
-            store_control(c, loop)
+            loop[ANSWER], c = control_plant(load_control(loop, 0), demand, y, p)
+            store_control(c, loop, 0)
         s, m = step_cycle(s, m, drive, inputs[2], inputs[4], t, record, steps)
     loop[CYCLES] += 1.0
     y, m = read_sensors(s, m, noise, loop[CYCLES] * p.controller.period, p)
     store_readings(y, out)
     out[len(y)] = loop[ANSWER]
-    pack_state((s, m), flat)
+    pack_state((s, m), flat, 0)

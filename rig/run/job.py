@@ -86,13 +86,13 @@ class Job(RunSettings):
         require(self.plant == "external" or not self.bench.has_plant_node or speaks_as_shipped(self.bench),
                 "--plant", self.plant,
                 f"external: our own plant emulator does not speak as that of {self.bench.name!r}")
-        is_possible = self.controller == "external" or speaks_as_shipped(self.bench) or (
-            self.controller == "builtin" and is_plant_bench(self.bench))
-        require(is_possible, "--controller", self.controller,
+        require(self.controller == "external" or speaks_as_shipped(self.bench)
+                or (self.controller == "builtin" and is_plant_bench(self.bench)), "--controller", self.controller,
                 f"external: our own firmware does not speak as the device of {self.bench.name!r}")
         object.__setattr__(self, "sequence", self.sequence.at_rate(self.bench.rate))
         object.__setattr__(self, "model", self.model.replace({"controller.period": self.period_ns / 1e9}))
         self._require_range()
+        self.model.require_acting_load(self.sequence.load_profile(), self.sequence.name)
 
     def _require_range(self) -> None:
         """Refuse a demand that its frame cannot hold: the frame would carry another one than the checks judge."""

@@ -164,7 +164,7 @@ def test_ripple_is_a_line_in_the_speed() -> None:
 def _moved(flat, spool, load, record, h, out):
     """Metering edges and ram alone, the spool on a given path; rows XJ, P12."""
     p = record[0]
-    s, m = unpack_state(flat)
+    s, m = unpack_state(flat, 0)
     k = compute_coefficients(p, h)
     for i in range(len(spool)):
         u = Input(0.0, load[i], 0.0, i * h, 0.0, h)

@@ -59,7 +59,7 @@ def replay_drive(flat: Any, drive: Any, load: Any, position: Any, anchor: float,
         out: (n, outputs), written.
     """
     p = record[0]
-    s, m = unpack_state(flat)
+    s, m = unpack_state(flat, 0)
     s, m = rest_at_reading(s, m, position[0], p, steps) if len(position) else (show_start(s, m, p), m)
     for k in range(len(drive)):
         t = k * p.controller.period
@@ -219,7 +219,7 @@ def test_what_does_not_fit_is_refused() -> None:
 def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lanes of the step became vector code, as a loop or at once: nothing in the step stops it."""
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
-    plan = plan_layout((), Model().kind, FEWEST)
+    plan = plan_layout((), Model().kind, Model().build_record().dtype, FEWEST)
     run = compile_function(plan.loop, plan.names)
     run(np.zeros(plan.numbers * FEWEST), CURRENT, FORCE, np.empty(0), 0.0, 0.0, False, 1e-3, 10,
         0, len(CURRENT), 0, 0, True, np.arange(FEWEST, dtype=np.uint64), np.empty((FEWEST, 3, len(CURRENT))))

@@ -25,9 +25,7 @@ def run_command(args: argparse.Namespace) -> int:
     period = model["controller.period"]
     signals = model.kind.signals
     com, load, name = load_command(args.command_file, period, model.kind)
-    ways = model.kind.loaded_by
-    require(not ways or load is None or not load.any() or {*ways} & {*model.effects}, name, "load",
-            "0, or a model in which it acts: " + " or ".join(f"--set {model.find_effect(e).fitted[0]}=1" for e in ways))
+    model.require_acting_load(load, name)
     require(not args.steps or model.kind.foreign is None, "--steps", str(args.steps),
             "a plant with equations; an FMU has steps of its own")
     out = Path(args.out or "simulation.csv")
