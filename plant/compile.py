@@ -375,12 +375,14 @@ def _declare_part(f: Function) -> Function:
 
     No fastmath: one run and many at once, and plain Python, agree to the last bit. No way in from Python for what is
     only called by compiled code: unpacking nested tuples of a hundred numbers takes longer to compile than the physics.
+    The physics does not count who uses an array; a user's law may have one of its own, as np.interp has.
     """
     import numba
 
+    is_ours = Path(f.__code__.co_filename).is_relative_to(Path(__file__).parent)
     return numba.njit(  # type: ignore[call-overload]  # its stubs do not know two of the options
         f, error_model="numpy", forceinline=not vars(f).get("is_apart", False), no_cpython_wrapper=True,
-        no_cfunc_wrapper=True, pipeline_class=_make_part_compiler())
+        no_cfunc_wrapper=True, _nrt=not is_ours, pipeline_class=_make_part_compiler())
 
 
 @cache
@@ -409,8 +411,15 @@ def _make_part_compiler() -> Any:
         def get_pointer_to_function(self, name: str) -> int:
             return 0
 
+    class Arguments(tuple[Any, ...]):
+        """Types of arguments in few words: numba writes them out before each step, which for a record takes long."""
+
+        def __repr__(self) -> str:
+            return f"{len(self)} arguments"
+
     class PartCompiler(core.compiler.Compiler):  # type: ignore[misc]
         def define_pipelines(self) -> Any:
+            self.state.args = Arguments(self.state.args)
             self.state.library = Part(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
             return super().define_pipelines()
 
