@@ -356,9 +356,8 @@ def _declare_part_once(family: Hashable, f: Function) -> Function:
 
     Equal are functions of the same code that name the same objects; a part keeps these, so their addresses stay theirs.
     """
-    cells = [cell.cell_contents for cell in f.__closure__ or ()]
     named = _find_globals(f)
-    parts = *(f.__defaults__ or ()), *cells, *named.values()
+    parts = *(f.__defaults__ or ()), *(cell.cell_contents for cell in f.__closure__ or ()), *named.values()
     key = family, f.__code__, vars(f).get("is_apart", False), *named, *map(id, parts)
     if key not in _PARTS:
         _PARTS[key] = _declare_part(f)
@@ -379,10 +378,10 @@ def _declare_part(f: Function) -> Function:
     """
     import numba
 
-    is_ours = Path(f.__code__.co_filename).is_relative_to(Path(__file__).parent)
     return numba.njit(  # type: ignore[call-overload]  # its stubs do not know two of the options
         f, error_model="numpy", forceinline=not vars(f).get("is_apart", False), no_cpython_wrapper=True,
-        no_cfunc_wrapper=True, _nrt=not is_ours, pipeline_class=_make_part_compiler())
+        no_cfunc_wrapper=True, _nrt=not Path(f.__code__.co_filename).is_relative_to(Path(__file__).parent),
+        pipeline_class=_make_part_compiler())
 
 
 @cache
