@@ -383,10 +383,13 @@ def measure_frozen(rows: Rows, limit: float | None, words: ProfileWords = CIA408
 
     Only cycles in which control and status word say ACTIVE, and not those within 2 % of the current limit. `limit`:
     what the controller says it is, A; None: it does not say, and the largest current of the run counts as the limit.
+    A frame that is missing or late is not one with the same current: how many those may be, another check says.
     """
     largest = np.nanmax(np.abs(rows.drive), initial=0.0) if limit is None else limit
     is_limited = np.abs(rows.drive) >= 0.98 * largest
-    is_closed = _find_active(rows, words) & (find_states(rows, words) == State.ACTIVE) & ~is_limited
+    is_missing = np.append(rows.flags[1:], 0).astype(int) & int(Flags.DRIVE_LATE | Flags.DRIVE_MISSING) != 0
+    is_answered = rows.on_time & ~is_missing
+    is_closed = _find_active(rows, words) & (find_states(rows, words) == State.ACTIVE) & ~is_limited & is_answered
     error = rows.demand - rows.position
     stays = is_closed[1:] & is_closed[:-1] & (rows.drive[1:] == rows.drive[:-1]) & ~np.isnan(error[1:] + error[:-1])
     edges = np.flatnonzero(np.diff(np.concatenate(([0], stays.astype(int), [0]))))

@@ -20,7 +20,7 @@ from fdi.report import build_run_report, format_report
 from fdi.trace import CheckResult, Trace
 from plant import EHA, Array, Columns, Hold, Segment, Signals, build_profile
 from plant.segments import Ramp, Step
-from rig.benches import Bench, SensorCalibration, load_bench, load_bench_from_files
+from rig.benches import Bench, Flags, SensorCalibration, load_bench, load_bench_from_files
 from rig.sequences import (
     DriveFrames,
     Guard,
@@ -253,20 +253,21 @@ def test_heartbeats_that_waited_for_the_rig_are_not_judged(beats: list[Heartbeat
     assert [check.passed for check in checks if check.signal == "heartbeat"] == [*passes, *([] if deaf else [True])]
 
 
-@pytest.mark.parametrize(("frozen", "limit", "is_found"), [
-    (2e-4, 8e-3, True),  # it is also the largest current of the run
-    (8e-3, 8e-3, False),  # at the limit it says it has
-    (2e-4, None, False),  # a controller that does not say its limit may have this one
+@pytest.mark.parametrize(("frozen", "limit", "flags", "is_found"), [
+    (2e-4, 8e-3, Flags(0), True),  # it is also the largest current of the run
+    (8e-3, 8e-3, Flags(0), False),  # at the limit it says it has
+    (2e-4, None, Flags(0), False),  # a controller that does not say its limit may have this one
+    (2e-4, 8e-3, Flags.DRIVE_MISSING, False),  # no frame came: the last current stays, and another check counts them
 ])
 def test_a_current_that_stands_still_below_the_limit_is_found(
-    frozen: float, limit: float | None, is_found: bool
+    frozen: float, limit: float | None, flags: Flags, is_found: bool
 ) -> None:
     cycles = 100
     error = np.linspace(0.0, 1e-3, cycles)
     current = np.where(np.arange(cycles) < 50, 1e-5 * np.sin(np.arange(cycles)), frozen)
     zero, words = np.zeros(cycles), np.full(cycles, 15.0)
-    rows = Rows(demand=error, position=zero, drive=current, control=words, status=words, flags=zero, response=zero,
-                on_time=np.ones(cycles, bool))
+    rows = Rows(demand=error, position=zero, drive=current, control=words, status=words,
+                flags=np.full(cycles, int(flags)), response=zero, on_time=np.ones(cycles, bool))
     assert (measure_frozen(rows, limit) > 4e-4) == is_found
 
 
