@@ -1,15 +1,15 @@
 """When a kernel for few effects is worth compiling: what has been computed without it so far says.
 
 The kernel with all effects of a catalogue makes 50 million steps per second, one with a single costly effect and the
-cheap ones 140 to 230 million. To compile one takes 5 s, to load it from the disk 0.1 s. So it is compiled once the
-larger kernel has spent about 2 s on runs that it could have made, and loaded after a twentieth of that. Which of them
-makes a run changes no bit of it.
+cheap ones 140 to 230 million. To compile one takes 2 to 3 s, to load it from the disk 0.1 s. So it is compiled once the
+larger kernel has spent about 0.8 s on runs that it could have made, as it also serves the commands that follow, and
+loaded after an eighth of that. Which of them makes a run changes no bit of it.
 """
 
 import threading
 from collections.abc import Callable, Hashable
 
-WORTH_COMPILING = 100e6  # steps of all lanes that another kernel has made in its place
+WORTH_COMPILING = 40e6  # steps of all lanes that another kernel has made in its place
 WORTH_LOADING = 5e6
 
 
