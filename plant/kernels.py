@@ -1,9 +1,8 @@
 """What kernels call of a plant: placeholders here, bound to the functions of a plant with its effects when compiled.
 
 The functions that a plant's signals determine are written out as source text, since compiled code knows the number of
-readings, and which parameter is the noise of which. So are the conversions between nested tuples, which the physics
-uses, and a flat array of floats, which stores them (the state of a model with effects nests their memories): as plain
-assignments compiled code moves numbers between registers and the buffer and nothing else.
+readings, and which parameter is the noise of which. The physics uses nested tuples (the state of a model with effects
+nests their memories), stored in a flat array of floats: `make_packers` gives the calls that move them.
 """
 
 import itertools

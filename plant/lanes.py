@@ -386,6 +386,7 @@ class KernelVariant:
         self.model = replace(model, effects=effects, values={n: v for n, v in model.values.items() if n in own})
         self._laws = model.kind.list_laws(effects)
         self._state: Array | None = None
+        # parameters of all shipped effects: kernels with records of one type have most of their functions in common
         complete = self.model.with_effects(e.name for e in model.kind.list_effects() if _is_shipped(e))
         self._names, self._record = complete.list_names(), complete.build_record()
         # lanes of its blocks: a costly effect keeps the processor busy with one register, else a step is half waiting;
