@@ -454,12 +454,16 @@ def test_nominal_is_an_integrator_and_unequal_areas_make_it_faster_backwards() -
     assert -forwards / backwards == pytest.approx(0.68, rel=1e-6)
 
 
-@pytest.mark.parametrize(("words", "message"), [
-    ("run", "a sequence of your own"), ("run --bench eha", "a sequence of your own"),
-    ("simulate --command push.csv", "push.csv: load: expected 0, or a model in which it acts: --set external_load")])
+@pytest.mark.parametrize(("words", "file", "text", "message"), [
+    ("run", "none", "", "a sequence of your own"), ("run --bench eha", "none", "", "a sequence of your own"),
+    ("simulate --command push.csv", "push.csv", "t,com,load\n0,0,100\n0.001,0,100\n",
+     "push.csv: load: expected 0, or a model in which it acts: --set external_load"),
+    ("run push.toml", "push.toml", 'title = "Push"\nmain = [{ kind = "hold", time = 0.5 }]\n'
+     'load = [{ kind = "step", to = 1000.0, time = 0.2 }]\n',
+     "push.toml: load: expected 0, or a model in which it acts: --set external_load")])
 def test_a_test_that_it_does_not_declare_and_a_load_that_acts_nowhere_are_refused(
-        here: Path, words: str, message: str) -> None:
-    write_file(here / "push.csv", "t,com,load\n0,0,100\n0.001,0,100\n")
+        here: Path, words: str, file: str, text: str, message: str) -> None:
+    write_file(here / file, text)
     assert message in refuse(*words.split(), "--model", "ehs")
 
 
