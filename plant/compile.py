@@ -17,6 +17,7 @@ import os
 import shutil
 import stat
 import tempfile
+from abc import ABC, abstractmethod
 from collections import namedtuple
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
@@ -35,12 +36,12 @@ Function = Any  # a plain function, or numba's dispatcher of one
 AnyFunction = TypeVar("AnyFunction", bound=Callable[..., Any])
 
 
-class CompiledCall:
+class CompiledCall(ABC):
     """A call that compiled code has instructions of its own for; its content is its fingerprint."""
 
+    @abstractmethod
     def declare(self) -> Any:
         """What numba compiles into the call."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -347,9 +347,8 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
         is_judged = rows.on_time & ~_find_faulty(record) if rows is record.run else rows.on_time
         # the first of the frames that come in every n-th cycle may come as late as in the n-th
         is_judged = is_judged & (np.arange(len(is_judged)) >= record.bench.frames.drive.every - 1)
-        flags = np.append(rows.flags[1:], 0).astype(int)  # what the plant found at the next SYNC
-        is_wrong = is_judged & (flags & int(Flags.DRIVE_LATE) != 0)
-        is_missing = is_judged & ~is_wrong & (np.isnan(rows.drive) | (flags & int(Flags.DRIVE_MISSING) != 0))
+        is_wrong = is_judged & _find_flagged(rows, Flags.DRIVE_LATE)
+        is_missing = is_judged & ~is_wrong & (np.isnan(rows.drive) | _find_flagged(rows, Flags.DRIVE_MISSING))
         wrong += int(is_wrong.sum())
         missing += int(is_missing.sum())
         cycles += int(is_judged.sum())
@@ -364,6 +363,11 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
     if any(each.guard for spec in specs for each in spec.fields):
         yield _make_result("wrong checksums and alive counters", "drive", record.unsound, "1",
                            high=largest_share * cycles)
+
+
+def _find_flagged(rows: Rows, flags: Flags) -> Mask:
+    """The cycles of whose drive frame the plant found one of these at the next SYNC."""
+    return (np.append(rows.flags[1:], 0).astype(int) & int(flags)).astype(bool)
 
 
 def _judge_frozen(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
@@ -387,8 +391,7 @@ def measure_frozen(rows: Rows, limit: float | None, words: ProfileWords = CIA408
     """
     largest = np.nanmax(np.abs(rows.drive), initial=0.0) if limit is None else limit
     is_limited = np.abs(rows.drive) >= 0.98 * largest
-    is_missing = np.append(rows.flags[1:], 0).astype(int) & int(Flags.DRIVE_LATE | Flags.DRIVE_MISSING) != 0
-    is_answered = rows.on_time & ~is_missing
+    is_answered = rows.on_time & ~_find_flagged(rows, Flags.DRIVE_LATE | Flags.DRIVE_MISSING)
     is_closed = _find_active(rows, words) & (find_states(rows, words) == State.ACTIVE) & ~is_limited & is_answered
     error = rows.demand - rows.position
     stays = is_closed[1:] & is_closed[:-1] & (rows.drive[1:] == rows.drive[:-1]) & ~np.isnan(error[1:] + error[:-1])
