@@ -218,8 +218,8 @@ def read_normal_tables() -> NormalTables:
 
 def find_cache_folder() -> Path:
     """The folder of compiled code: $EHA_RIG_CACHE, else the user's cache folder, else a temporary one."""
-    folder = os.environ.get("EHA_RIG_CACHE")
-    home = Path(folder) if folder else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eha-rig"
+    home = Path(os.environ.get("EHA_RIG_CACHE")
+                or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eha-rig")
     try:
         home.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=home):
@@ -248,8 +248,8 @@ def _make_folder_of_process() -> Path:
 def rebind_names(function: Function, **names: Any) -> Function:
     """A copy of `function` that sees `names` in place of its module's globals."""
     # said to be at home here: numba imports that home again when it reads its cache, and a user's file is no module
-    there = function.__globals__ | names | {"__name__": __name__}
-    copy = FunctionType(function.__code__, there, function.__name__, function.__defaults__, function.__closure__)
+    copy = FunctionType(function.__code__, function.__globals__ | names | {"__name__": __name__}, function.__name__,
+                        function.__defaults__, function.__closure__)
     vars(copy).update(vars(function))
     return copy
 
@@ -269,10 +269,9 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
     import numba.core.compiler_lock  # here and below: who only reads a trace need not load it, which takes 0.3 s
 
     _let_lanes_fill_registers()
-    root = _link_calls(function, ports or {}, lambda f: f)
     linked_root = _link_calls(function, ports or {}, partial(_declare_part_once, family), _declare_call_once)
     settings: Any = numba.config
-    folder = _find_folder_of_code(root)
+    folder = find_cache_folder() / compute_fingerprint(interpret_function(function, ports))
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
         before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
         try:
@@ -320,12 +319,7 @@ def _compile_in_one_process(dispatcher: Any, folder: Path) -> None:
 
 def is_function_stored(function: Function, ports: Mapping[str, Function] | None = None) -> bool:
     """Whether machine code of what `compile_function` would compile is on the disk, be it for this CPU or another."""
-    return any(_find_folder_of_code(_link_calls(function, ports or {}, lambda f: f)).rglob("*.nbc"))
-
-
-def _find_folder_of_code(root: Function) -> Path:
-    """The folder of the machine code of a linked function."""
-    return find_cache_folder() / compute_fingerprint(root)
+    return any((find_cache_folder() / compute_fingerprint(interpret_function(function, ports))).rglob("*.nbc"))
 
 
 def keep_apart(function: AnyFunction) -> AnyFunction:
@@ -375,14 +369,23 @@ def _declare_part(f: Function) -> Function:
 
     No fastmath: one run and many at once, and plain Python, agree to the last bit. No way in from Python for what is
     only called by compiled code: unpacking nested tuples of a hundred numbers takes longer to compile than the physics.
-    The physics does not count who uses an array; a user's law may have one of its own, as np.interp has.
+    The physics does not count who uses an array; a user's law may have one of its own, as np.interp has. No code for
+    each number that a call names: it becomes part of its caller, which knows the number.
     """
     import numba
 
-    return numba.njit(  # type: ignore[call-overload]  # its stubs do not know two of the options
+    part: Any = numba.njit(  # type: ignore[call-overload]  # its stubs do not know two of the options
         f, error_model="numpy", forceinline=not vars(f).get("is_apart", False), no_cpython_wrapper=True,
         no_cfunc_wrapper=True, _nrt=not Path(f.__code__.co_filename).is_relative_to(Path(__file__).parent),
         pipeline_class=_make_part_compiler())
+
+    def find_common_code(arguments: Any, named: Any, find_code: Any = part.get_call_template) -> Any:
+        with contextlib.suppress(numba.errors.TypingError):  # of code that needs the number, as the index of a tuple
+            return find_code([*map(numba.types.unliteral, arguments)], named)
+        return find_code(arguments, named)
+
+    part.get_call_template = find_common_code
+    return part
 
 
 @cache
@@ -451,8 +454,8 @@ def _link_calls(function: Function, ports: Mapping[str, Function], make: Callabl
 def _find_globals(function: Function) -> dict[str, Any]:
     """The module-level names `function` reads, with their values."""
     function = getattr(function, "py_func", function)
-    there = function.__globals__
-    return {name: there[name] for name in _list_global_names(function.__code__) if name in there}
+    return {name: function.__globals__[name] for name in _list_global_names(function.__code__)
+            if name in function.__globals__}
 
 
 @cache
