@@ -138,8 +138,8 @@ def compute_needed_drive(model: Model, motion: Array, load: Array) -> Array:
         load: (n,) external load.
     """
     out = np.empty(len(motion))
-    run = build_kernel(fill_needed_drive, model.effects, plant=model.plant)
-    run(model.build_start()[1], np.ascontiguousarray(motion), np.ascontiguousarray(load), model.build_record(), out)
+    build_kernel(fill_needed_drive, model.effects, plant=model.plant)(
+        model.build_flat_state(), np.ascontiguousarray(motion), np.ascontiguousarray(load), model.build_record(), out)
     return out
 
 

@@ -122,9 +122,10 @@ def run_controller(flat: Any, control: Any, com: Any, readings: Any, record: Any
         out[k], c = control_plant(c, demand, y, p)
 
 
-def fill_needed_drive(m: Memory, motion: Any, load: Any, record: Any, out: Any) -> None:
-    """Fills out[k] with the drive at row k."""
+def fill_needed_drive(flat: Any, motion: Any, load: Any, record: Any, out: Any) -> None:
+    """Fills out[k] with the drive at row k; of `flat`, a state of the plant, only the memories are used."""
     p = record[0]
+    m = unpack_state(flat, 0)[1]
     for k in range(len(motion)):
         u = Input(0.0, load[k], 0.0, k * p.controller.period, 0.0, p.controller.period)
         out[k], m = invert_plant(motion[k, 0], motion[k, 1], motion[k, 2], m, u, p)
