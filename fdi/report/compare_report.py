@@ -25,6 +25,7 @@ from fdi.report.drawing import (
     call,
     choose_colour,
     choose_drawn_unit,
+    draw_grid,
     draw_over_time,
     draw_panels,
     instant,
@@ -426,9 +427,9 @@ def draw_deviation_map(c: Comparison) -> str:
 
 def draw_whiteness(c: Comparison) -> str:
     """One row per signal: autocorrelation, cumulative periodogram, cross-correlation with the current."""
-    return draw_panels("whiteness", [_draw_tests(d, c.trace.period, c.signals[name].signal.symbol,
-                                                 c.trace.declared.drive.symbol)
-                                     for name, d in c.diagnoses.items()], 2.4 * len(c.diagnoses))
+    return draw_grid("whiteness", [_draw_tests(d, c.trace.period, c.signals[name].signal.symbol,
+                                               c.trace.declared.drive.symbol) for name, d in c.diagnoses.items()],
+                     2.4 * len(c.diagnoses), 0.85)
 
 
 def _draw_tests(d: ResidualTests, period: float, label: str, drive: str) -> list[Panel]:
@@ -457,8 +458,8 @@ def draw_dependence(c: Comparison) -> str:
     kinds = [kind for kind in possible if any(kind in dependences for dependences in by.values())]
     if not kinds:
         return ""
-    return draw_panels("dependence", [_draw_means(c, name, kinds, dependences) for name, dependences in by.items()],
-                       2.3 * len(by))
+    return draw_grid("dependence", [_draw_means(c, name, kinds, dependences) for name, dependences in by.items()],
+                     2.3 * len(by), 0.55)
 
 
 def _draw_means(c: Comparison, name: str, kinds: Sequence[str], by: dict[str, Depends]) -> list[Panel]:

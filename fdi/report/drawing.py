@@ -170,11 +170,21 @@ def draw_panels(salt: str, rows: Sequence[Sequence[Panel]], height: float, width
         return to_svg(figure, salt)
 
 
+def draw_grid(salt: str, rows: Sequence[Sequence[Panel]], height: float, gap: float) -> Drawing:
+    """Rows of panels in a figure of this height, `gap` between those of a row, in inches; the margins are fixed.
+
+    A layout that measures every tick label first takes as long as the drawing.
+    """
+    return draw_panels(salt, rows, height, 11.0, layout=None, gridspec_kw={
+        "left": 0.85 / 11.0, "right": 1.0 - 0.1 / 11.0, "top": 1.0 - 0.25 / height, "bottom": 0.45 / height,
+        "wspace": gap * len(rows[0]) / (10.05 - gap * (len(rows[0]) - 1)), "hspace": 0.7 / (height / len(rows) - 0.7)})
+
+
 def draw_over_time(salt: str, trace: Trace, panels: Sequence[Panel], heights: Sequence[float], gap: float = 0.22,
                    xlabel: str = "time [s]") -> Drawing:
     """Panels above each other on the time axis of a trace, as high as `heights` says (inches), with its sections.
 
-    The margins are fixed: a layout that measures every tick label first takes as long as the drawing.
+    The margins are fixed, as those of `draw_grid`.
     """
     width, left, right, top, bottom = 11.0, 0.95, 0.1, 0.3, 0.5
     height = top + sum(heights) + gap * (len(heights) - 1) + bottom
