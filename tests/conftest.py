@@ -16,6 +16,10 @@ from long_tests import LONG_TESTS, LONGEST
 from plugin_bus import require_bus_kind
 from rig_command import STARTED, rig
 
+from plant.compile import _let_lanes_fill_registers
+
+_let_lanes_fill_registers()  # before a test gives numba a function of its own: numba reads that setting once
+
 pytest_plugins = ["plugin_bus", "pytester"]
 
 # An example that took longer than hypothesis expects tells of the machine and not of the code.

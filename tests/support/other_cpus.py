@@ -22,9 +22,8 @@ HASWELL = ("sse3", "ssse3", "sse4.1", "sse4.2", "popcnt", "avx", "avx2", "fma", 
 
 def compiles_for(feature: str) -> bool:
     """Whether numba compiles for a CPU with this feature: this one, or the one that NUMBA_CPU_NAME names."""
-    from numba.core.registry import cpu_target
-
-    return f"+{feature}" in cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+    return f"+{feature}" in os.environ.get(
+        "NUMBA_CPU_FEATURES", "" if "NUMBA_CPU_NAME" in os.environ else get_host_cpu_features().flatten()).split(",")
 
 
 def list_disabled_features(*instruction_sets: str) -> str:
