@@ -35,8 +35,8 @@ from studies.hidden_effects import command, hidden, score
 from studies.hidden_effects.truth import SYMBOLS, has_compiler, nominal_symbols, parameter_names, simulate_truth
 from studies.long_recordings import make_command, record_unit
 from studies.peers import grid_runs, many_runs, rivals
+from studies.robustness import run_study as robustness
 from studies.robustness.disturb import disturb_run, find_processes, judge_verdict
-from studies.robustness.run_study import build_robustness_report, run_study
 from studies.servo_ledger import fit_directional_gains
 
 
@@ -202,22 +202,23 @@ def test_a_log_that_cannot_be_written() -> None:
     assert trial.problems == () and trial.status == 2 and "log" in trial.message, trial
 
 
-def test_the_study_as_a_whole() -> None:
-    """Fuzz frames into both nodes and the rig, datagrams on the bus, changed logs, and runs one after the other.
+def test_the_study_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fuzz frames into both nodes and the rig, datagrams on the bus, changed logs, and short runs one after the other.
 
     Some of the changed logs are still good enough to be read; the others are refused, and nothing else happens.
     """
-    figures = run_study(2000, 0, 0.01, 1, "builtin", lambda stage, share: None)
+    monkeypatch.setattr(robustness, "SEQUENCE", robustness.SEQUENCE.replace("time = 3.0", "time = 0.3"))
+    figures = robustness.run_study(2000, 0, 0.01, 1, "builtin", lambda stage, share: None)
     assert figures["problems"] == [] and figures["soak"]["verdicts"] == {"PASS": figures["soak"]["runs"]}
     assert [count["works"] and count["frames"] >= 2000 for count in figures["frames"]] == [True] * 3
     assert min(count["answers"] for count in figures["frames"][:2]) > 40
     assert max(figures["datagrams"]["growth"].values()) < 16 << 20
     logs = figures["logs"]
     assert logs["accepted"]["recover"] > 0 and logs["accepted"]["report"] + logs["refused"]["report"] == 2
-    report = build_robustness_report(figures)
+    report = robustness.build_robustness_report(figures)
     assert report.verdict == "PASS" and len(report.sections) == 4
     assert not find_processes("239.1.1.1")
-    assert build_robustness_report({**figures, "problems": ["it hung"]}).verdict == "FAIL"
+    assert robustness.build_robustness_report({**figures, "problems": ["it hung"]}).verdict == "FAIL"
 
 
 PRACTICE = SHARED / "practice"

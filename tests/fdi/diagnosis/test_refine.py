@@ -104,7 +104,7 @@ def test_a_model_with_a_known_effect_keeps_it() -> None:
     assert {f.name: f.centre for f in unknowns}["null_bias.current"] == 5e-5
 
 
-COMMAND = np.concatenate([PREFLIGHT[2000:4200], PREFLIGHT[9000:11600]])  # steps, a ramp and a sine
+COMMAND = np.concatenate([PREFLIGHT[2500:4500], PREFLIGHT[9000:10200]])  # steps, a ramp and a sine
 
 
 @pytest.fixture(scope="module")

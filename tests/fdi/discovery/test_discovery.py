@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import pytest
 from effect_files import HEAD, SEARCHED, restored_catalogue
-from effects_cases import LAWS
 from noisy_traces import SHORT, record_plant
 from refusals import catch_refusal
 from rig_command import rig, write_file
@@ -122,7 +121,7 @@ def test_independent_noise_of_any_colour_does_not_repeat_and_physics_does() -> N
 def _recorded(changes: dict[str, float], seed: int = 0) -> Trace:
     t = np.arange(3000) * 1e-3
     com = 5e-3 * np.sign(np.sin(2 * np.pi * t))
-    return simulate_trace(Model().with_effects(LAWS).replace(changes), com, seed=seed)
+    return simulate_trace(Model().replace(changes), com, seed=seed)
 
 
 def test_the_firmware_leaves_its_mark_without_noise() -> None:

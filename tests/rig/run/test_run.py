@@ -149,42 +149,6 @@ TEXTS = {"lost frames": FAULTY, "a guard": GUARDED, "trouble": THREE_LOST,
          "repeated": REPEATED, "corrupted": CORRUPTED, "short command": SHORT_COMMAND}
 
 
-@pytest.fixture(scope="module")
-def bus_with_nodes() -> Iterator[str]:
-    """A bus on which both nodes stay from run to run."""
-    where = spec("udp_multicast")
-    with stand_nodes(where, PLANT, CONTROLLER):
-        yield where
-
-
-@pytest.mark.parametrize("name", TEXTS)
-def test_compiled_cycles_in_lockstep_are_those_in_python(bus_with_nodes: str, name: str, tmp_path: Path) -> None:
-    """The same rows and the same events in the same cycles, whatever the faults, also where the run is aborted.
-
-    A heartbeat that stops is not among them: in lockstep between processes nobody watches heartbeats. The rows of the
-    preflight are compared in test_c_run.py, on a CAN interface in test_vcan_guest.py.
-    """
-    text = TEXTS[name]
-    local_run = play(job(text, seed=3), tmp_path / "a")
-    external_run = play(job(text, seed=3, bus=bus_with_nodes, controller="external", plant="external"), tmp_path / "b")
-    assert external_run.timing["kind"] == "lockstep" and (
-        external_run.verdict, external_run.aborted) == (local_run.verdict, local_run.aborted)
-    fields = ("cycle", "phase", "com", "xj", "cor", "p12", "xs", "load", "control", "status", "flags")
-    rows = [table(tmp_path / folder, fields) for folder in "ab"]
-    assert rows[0] == rows[1] and len(rows[0]) >= 150
-    kinds = {"phase", "section", "fault", "guard", "emcy", "safe_state", "abort", "recovered"}
-    events = [[(event.t, event.kind, event.text) for event in one.events if event.kind in kinds and event.t >= 0
-               and "(after the run)" not in event.text] for one in (local_run, external_run)]
-    # That a short drive frame is whole again is said by the services of the plant, perhaps a cycle later.
-    assert events[0] == events[1] or name == "corrupted"
-
-
-def table(folder: Path, fields: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """All cycles in the log as texts, in which NaN equals NaN."""
-    columns = open_log(folder / "trace.mcap").read_columns("/signals")
-    return [tuple(map(str, row)) for row in zip(*(columns[name].tolist() for name in fields), strict=True)]
-
-
 # The guest has one CPU of a tenth of the speed and a clock of 100 Hz: no real time there.
 REALTIME = ["udp_multicast"] + ["socketcan"] * (kernel_has_vcan0() and "EHA_RIG_GUEST" not in os.environ)
 
@@ -374,6 +338,42 @@ def test_nodes_that_were_there_before_are_taken_and_left_alone(where: str, tmp_p
     assert "incoming frames lost 0" in results[0].out
     assert results[1].json == {"node": "controller", "bus": where, "lost": 0, "unsent": 0, "error_frames": 0}
     assert np.array_equal(read_signals(tmp_path / "b"), reference), outcome.counters
+
+
+@pytest.fixture(scope="module")
+def bus_with_nodes() -> Iterator[str]:
+    """A bus on which both nodes stay for the tests that follow: nodes that wait take time too."""
+    where = spec("udp_multicast")
+    with stand_nodes(where, PLANT, CONTROLLER):
+        yield where
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_compiled_cycles_in_lockstep_are_those_in_python(bus_with_nodes: str, name: str, tmp_path: Path) -> None:
+    """The same rows and the same events in the same cycles, whatever the faults, also where the run is aborted.
+
+    A heartbeat that stops is not among them: in lockstep between processes nobody watches heartbeats. Rows of
+    the firmware in C are compared in test_c_run.py, on a CAN interface in test_vcan_guest.py.
+    """
+    text = TEXTS[name]
+    local_run = play(job(text, seed=3), tmp_path / "a")
+    external_run = play(job(text, seed=3, bus=bus_with_nodes, controller="external", plant="external"), tmp_path / "b")
+    assert external_run.timing["kind"] == "lockstep" and (
+        external_run.verdict, external_run.aborted) == (local_run.verdict, local_run.aborted)
+    fields = ("cycle", "phase", "com", "xj", "cor", "p12", "xs", "load", "control", "status", "flags")
+    rows = [table(tmp_path / folder, fields) for folder in "ab"]
+    assert rows[0] == rows[1] and len(rows[0]) >= 150
+    kinds = {"phase", "section", "fault", "guard", "emcy", "safe_state", "abort", "recovered"}
+    events = [[(event.t, event.kind, event.text) for event in one.events if event.kind in kinds and event.t >= 0
+               and "(after the run)" not in event.text] for one in (local_run, external_run)]
+    # That a short drive frame is whole again is said by the services of the plant, perhaps a cycle later.
+    assert events[0] == events[1] or name == "corrupted"
+
+
+def table(folder: Path, fields: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """All cycles in the log as texts, in which NaN equals NaN."""
+    columns = open_log(folder / "trace.mcap").read_columns("/signals")
+    return [tuple(map(str, row)) for row in zip(*(columns[name].tolist() for name in fields), strict=True)]
 
 
 def test_the_memory_of_a_run_is_free_when_it_ends(
