@@ -271,7 +271,7 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
     _let_lanes_fill_registers()
     linked_root = _link_calls(function, ports or {}, partial(_declare_part_once, family), _declare_call_once)
     settings: Any = numba.config
-    folder = find_cache_folder() / compute_fingerprint(interpret_function(function, ports))
+    folder = find_code_folder(function, ports)
     with numba.core.compiler_lock.global_compiler_lock:  # the folder is a setting of the whole process
         before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
         try:
@@ -317,9 +317,9 @@ def _compile_in_one_process(dispatcher: Any, folder: Path) -> None:
     dispatcher.compile = compile_alone
 
 
-def is_function_stored(function: Function, ports: Mapping[str, Function] | None = None) -> bool:
-    """Whether machine code of what `compile_function` would compile is on the disk, be it for this CPU or another."""
-    return any((find_cache_folder() / compute_fingerprint(interpret_function(function, ports))).rglob("*.nbc"))
+def find_code_folder(function: Function, ports: Mapping[str, Function] | None = None) -> Path:
+    """The folder for the machine code of what `compile_function` compiles; its name is a hash of all that goes in."""
+    return find_cache_folder() / compute_fingerprint(interpret_function(function, ports))
 
 
 def keep_apart(function: AnyFunction) -> AnyFunction:

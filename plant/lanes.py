@@ -20,8 +20,8 @@ from plant.compile import (
     Function,
     ReadRecord,
     compile_function,
+    find_code_folder,
     is_costly,
-    is_function_stored,
     raise_unbound,
     rebind_names,
 )
@@ -399,7 +399,7 @@ class KernelVariant:
         """Whether the kernel can make so many steps of all lanes now: see `KernelUse.is_ready`."""
         def is_stored() -> bool:
             plan = plan_layout(self.model.effects, self.model.kind, self._record.dtype, self.widths[0])
-            return is_function_stored(plan.loop, plan.names)
+            return any(find_code_folder(plan.loop, plan.names).rglob("*.nbc"))  # be it for this CPU or another
 
         return KERNEL_USE.is_ready(self.key, steps, is_stored, self.prepare)
 

@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, cast
@@ -205,7 +205,7 @@ class Plant:
     def list_effects(self) -> list[Effect]:
         """The effects it can have: those of the catalogue that suit it, then its own, which may have their names."""
         everything = CATALOGUE.list_all()
-        catalogue_effects = (e for e in map(self.find_effect, everything) if self.offers(e))
+        catalogue_effects = (e for e in map(self.find_effect, everything) if is_offered(e, self))
         return [*catalogue_effects, *(e for name, e in self.effects.items() if name not in everything)]
 
     def list_groups(self, names: Iterable[str] | None = None) -> dict[str, type[Any]]:
@@ -227,29 +227,6 @@ class Plant:
             cast("dict[str, Effect]", self.effects)[e.name] = e
         else:
             CATALOGUE[e.name] = e
-
-    def offers(self, e: Effect) -> bool:
-        """Whether a shared effect suits it: it has the port, in the same unit, and what else the law names."""
-        is_elsewhere = e.plant not in ("", self.name) or (self.file is not None and e.searched_in)
-        if is_elsewhere or e.name in self.lacks or self.foreign is not None:
-            return False
-        if e.base:
-            return all(name in self.nominal for name in e.fitted)
-        if e.port not in self.ports:
-            return False
-        if e.plant == self.name:
-            return True
-        unit, own_unit = PORTS[e.port].unit or "m", self.ports[e.port].unit  # of the EHA, for which it was written
-        is_own = e.function is not None and not e.function.__module__.startswith("plant.")  # in a file of the user's
-        has_unit = unit == own_unit or not any(unit in re.split(r"[ /()]", q.unit) for q in e.parameters.values())
-        return is_own or (has_unit and self._has_what_law_names(e))
-
-    def _has_what_law_names(self, e: Effect) -> bool:
-        """Whether the state has the fields, and the parameters the groups, that the law of an effect names."""
-        state = Sampled if e.port == "command" else self.state
-        return all(name in state._fields for name in find_fields_of(e.function, "s")) and all(
-            name in self.nominal or name in self.parameters or name.partition(".")[0] == e.name
-            for name in find_fields_of(e.function, "p", 2))
 
     def bind_functions(self, names: tuple[str, ...]) -> dict[str, Function]:
         """The functions that take the place of the placeholders in every kernel, for the plant with these effects."""
@@ -327,6 +304,32 @@ class Plant:
         """The plant at rest and the memories of the effects `names` at the start."""
         effects = [self.find_effect(name) for name in names]
         return self.state(), self.memory(*(combine_laws(port, effects)[1] for port in self.ports))
+
+
+@cache  # asked for each parameter that is named
+def is_offered(e: Effect, plant: Plant) -> bool:
+    """Whether a shared effect suits a plant: it has the port, in the same unit, and what else the law names."""
+    is_elsewhere = e.plant not in ("", plant.name) or (plant.file is not None and e.searched_in)
+    if is_elsewhere or e.name in plant.lacks or plant.foreign is not None:
+        return False
+    if e.base:
+        return all(name in plant.nominal for name in e.fitted)
+    if e.port not in plant.ports:
+        return False
+    if e.plant == plant.name:
+        return True
+    unit, own_unit = PORTS[e.port].unit or "m", plant.ports[e.port].unit  # of the EHA, for which it was written
+    is_own = e.function is not None and not e.function.__module__.startswith("plant.")  # in a file of the user's
+    has_unit = unit == own_unit or not any(unit in re.split(r"[ /()]", q.unit) for q in e.parameters.values())
+    return is_own or (has_unit and _has_what_law_names(e, plant))
+
+
+def _has_what_law_names(e: Effect, plant: Plant) -> bool:
+    """Whether the state has the fields, and the parameters the groups, that the law of an effect names."""
+    state = Sampled if e.port == "command" else plant.state
+    return all(name in state._fields for name in find_fields_of(e.function, "s")) and all(
+        name in plant.nominal or name in plant.parameters or name.partition(".")[0] == e.name
+        for name in find_fields_of(e.function, "p", 2))
 
 
 def _compute_no_coefficients(p: Any, h: float) -> float:

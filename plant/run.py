@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from plant.compile import compute_fingerprint, find_cache_folder, interpret_function
+from plant.compile import find_code_folder
 from plant.errors import InputError, RigError, require
 from plant.foreign import run_foreign_loop
 from plant.kernels import list_state_values, make_packers, write_reader
@@ -336,6 +336,5 @@ def load_stored_advance(effects: tuple[str, ...], plant: str = "eha") -> StoredC
 @cache
 def _load_stored_advance(effects: tuple[str, ...], laws: tuple[Any, ...], kind: Plant) -> StoredCode:
     # `laws` is part of the cache's key only: a user may load a changed file under the same effect names
-    source = compute_fingerprint(interpret_function(advance_flat_state, kind.bind_functions(effects)))
     compile_code = partial(build_kernel, advance_flat_state, effects, True, kind.key)
-    return StoredCode(find_cache_folder() / source, compile_code)
+    return StoredCode(find_code_folder(advance_flat_state, kind.bind_functions(effects)), compile_code)

@@ -98,7 +98,7 @@ from fdi.thresholds import (
     WEIGHT_COUNTS,
 )
 from fdi.trace import Floats, Trace
-from plant import Model, ensure_starts, find_quantity, list_searched_effects, map_in_threads, require
+from plant import Model, ensure_starts, find_quantity, is_offered, list_searched_effects, map_in_threads, require
 from plant.effects import CATALOGUE
 from plant.threads import R, T
 
@@ -220,7 +220,7 @@ def list_suspects(model: Model, faults: Sequence[Fault]) -> list[Suspect]:
     """The suspects that this plant can have and that are not among the faults."""
     fault_parameters = {name for fault in faults for name in fault.parameters}
     return [s for s in SUSPECTS if s.parameter not in fault_parameters and (
-        model.nominal.get(s.parameter, 0.0) > 0.0 if s.is_ratio else model.kind.offers(CATALOGUE[s.effect]))]
+        model.nominal.get(s.parameter, 0.0) > 0.0 if s.is_ratio else is_offered(CATALOGUE[s.effect], model.kind))]
 
 
 def _make_suspect(s: Suspect, model: Model) -> Free:

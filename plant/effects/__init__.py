@@ -36,7 +36,7 @@ __all__ = ["CATALOGUE", "Drag", "Effect", "Held", "Lag", "Law", "Line", "Quantit
 Law = Function
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Effect:
     """One entry of the catalogue."""
 

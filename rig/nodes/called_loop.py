@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from plant import StoredCode, compile_function, compute_fingerprint, find_cache_folder, interpret_function, keep_apart
+from plant import StoredCode, compile_function, find_code_folder, keep_apart
 from rig.network import PAYLOAD_OUT, QUEUE_FULL, SENT, TIMEOUT, Port, to_integer
 
 # Words of the port behind the payloads: the time, how many frames are to be sent, and these: identifier, length and 8
@@ -36,8 +36,8 @@ def call_loop(port: Port, run: Callable[[], object], t_ns: int) -> list[tuple[in
 
 def load_loop(function: Callable[..., object], make_trial: Callable[[], Sequence[Any]]) -> StoredCode:
     """The machine code of a loop: some seconds on a new machine. `make_trial`: its arguments for a trial."""
-    source = compute_fingerprint(interpret_function(function, IN_PYTHON))
-    code = StoredCode(find_cache_folder() / source, partial(compile_function, function, IN_PYTHON), function.__name__)
+    code = StoredCode(find_code_folder(function, IN_PYTHON), partial(compile_function, function, IN_PYTHON),
+                      function.__name__)
     code.warm(make_trial)
     return code
 

@@ -46,7 +46,7 @@ from rig.network import (
 from rig.nodes.scenario import Scenario
 from rig.sequences import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
 
-NOISE_RING = 1 << 16  # cycles of noise drawn ahead
+NOISE_RING = 1 << 14  # cycles of noise drawn ahead
 EVENT_RING = 256
 _HELD_FRAMES = 1 << 15  # late frames that can wait: two a cycle of 0.1 ms for the longest delay, and its drives
 _ANSWER_LIMIT = 80_000_000  # ns: in lockstep the answer to a late feedback frame is waited for this long
@@ -304,7 +304,7 @@ def _take_sync(port: Port, m: Memory, t_ns: int, length: int) -> None:
 
 
 def _wait_for_noise(port: Port, m: Memory) -> bool:
-    """Until the services, which draw a minute ahead, have drawn the noise of this cycle: no number is used twice.
+    """Until the services, which draw 16 s ahead at 1 kHz, have drawn the noise of this cycle: no number is used twice.
 
     False when the loop is to end.
     """
@@ -733,4 +733,6 @@ def _join_tables(start: int, kind: Any, *tables: Any) -> tuple[NDArray[Any], lis
     """One array with the tables behind each other from `start` on, and where each begins and the last ends."""
     flat = [np.asarray(table, kind).ravel() for table in tables]
     places = [start + int(n) for n in np.cumsum([0, *map(len, flat)])]
-    return np.concatenate([np.zeros(start, kind), *flat]), places
+    whole = np.zeros(places[-1], kind)  # takes memory where something is written: most runs are shorter than the rings
+    whole[start:] = np.concatenate(flat)
+    return whole, places

@@ -66,6 +66,8 @@ class EmulatorService(PlantNode):
         try:
             yield
         finally:
+            # each page of 512 numbers has its memory before the loop begins: it takes the kernel up to 10 us to find
+            self._memory.words[::512] |= 0
             self._memory.words[ec.STOP] = 0
             self._thread = threading.Thread(target=self._serve, name="emulator", daemon=True)
             self._thread.start()

@@ -220,7 +220,7 @@ class Loop(ABC):
         return f"the last that came had {why}" if why else ""
 
     def _draw_noise(self) -> None:
-        """Draw the noise of the plant for a minute ahead."""
+        """Draw the noise of the plant, 16 s ahead at 1 kHz."""
         if self._code:
             ec.fill_noise(self._plant, self._noise)
 

@@ -17,7 +17,6 @@ from plant import (
     StoredCode,
     build_kernel,
     compile,
-    compute_fingerprint,
     find_cache_folder,
     machine_code,
 )
@@ -77,7 +76,7 @@ def test_fingerprint_sees_what_a_function_depends_on() -> None:
     def made(source: str, k: object = 1.0) -> str:
         scope = {"K": k}
         exec(source, scope)
-        return compute_fingerprint(scope["f"])
+        return compile.compute_fingerprint(scope["f"])
 
     base = "def f(x, y=1.0):\n    return x * K + g(x)\ndef g(x):\n    return x"
     closure = "def make(k):\n    return lambda x: x * k\nf = make(1.0)"

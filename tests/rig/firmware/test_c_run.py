@@ -28,8 +28,9 @@ WAVES = SHORT.replace('{ name = "back", kind = "ramp", to = 0.0, time = 0.1 },',
 @needs_compiler
 def test_rows_are_byte_for_byte_those_of_the_builtin_controller(where: str, tmp_path: Path) -> None:
     """On a CAN interface the same is asked in tests/vcan."""
+    sequence = write_file(tmp_path / "waves.toml", WAVES)
     for controller, words in (("builtin", ()), ("c", ("--bus", where))):
-        assert answer("run", write_file(tmp_path / "waves.toml", WAVES), "--controller", controller, *words, "--out",
+        assert answer("run", sequence, "--controller", controller, *words, "--out",
                       tmp_path / controller)["verdict"] == "PASS"
     difference = describe_first_difference(tmp_path / "c", tmp_path / "builtin")
     assert (difference, nodes_on(where)) == ("none in 2150 rows", [])
