@@ -556,6 +556,7 @@ def list_moves_across(free: Sequence[Free], covariance: Floats, flat: Floats, wi
 
 def estimate_smooth_covariance(problem: Problem, fit: Fit, flat: Floats) -> Floats:
     """The covariance (p, p) of a fit by the slopes that the model has where it is smooth."""
+    fit = replace(fit, covariance=FIRST_WIDTH**2 * fit.covariance)
     for _ in range(SMOOTH_PASSES):
         fit = linearise_smoothly(problem, fit, flat)
     return fit.covariance

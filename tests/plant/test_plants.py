@@ -192,7 +192,8 @@ TIMES = "Hold(time=0.1), Step(to=0.5, time=0.9), Sine(amplitude=0.2, frequency=2
     pytest.param("    h, ratio,", "    late = min(1.0, 1.0 / u.t)\n    h, ratio,", id="division by zero"),
     pytest.param(TIMES, 'Step(to=0.5, time=0.1002),), values={"controller.period": 2e-4},', id="cycles of 0.2 ms"),
     pytest.param(TIMES, 'Step(to=0.5, time=0.3),), values={"controller.period": 3e-3},', id="333.3 cycles a second"),
-    pytest.param("Controller),\n", """Controller, NamedTuple("Jack", static_friction=Annotated[float, Quantity("N")])),
+    pytest.param("Controller),\n", """Controller,
+    NamedTuple("Jack", [("static_friction", Annotated[float, Quantity("N")])])),
     values={"jack.static_friction": 1.0},""", id="static friction alone"),
     pytest.param("class DryFriction(", """import plant.declare
 plant.declare.base_effect("wheel", Wheel, "damping", law="B", starts=(0.3,))

@@ -49,8 +49,8 @@ def play_both(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: Any, **
     monkeypatch.setattr(bring_up, "can_play_many", lambda master, bench: False)
     alone = play(job(*arguments, **settings), folder / "alone")
     assert read_log(folder / "together") == read_log(folder / "alone")
-    assert (together.verdict, together.aborted, together.checks) == (alone.verdict, alone.aborted, alone.checks)
-    assert together.events == alone.events
+    assert (together.verdict, together.aborted, together.events) == (alone.verdict, alone.aborted, alone.events)
+    assert str(together.checks) == str(alone.checks)  # words: a value that is not there, NaN, is not equal to itself
     return together
 
 
