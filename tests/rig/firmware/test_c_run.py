@@ -28,11 +28,11 @@ WAVES = SHORT.replace('{ name = "back", kind = "ramp", to = 0.0, time = 0.1 },',
 @needs_compiler
 def test_rows_are_byte_for_byte_those_of_the_builtin_controller(where: str, tmp_path: Path) -> None:
     """On a CAN interface the same is asked in tests/vcan."""
-    sequence = write_file(tmp_path / "waves.toml", WAVES)
-    for controller, words in (("builtin", ()), ("c", ("--bus", where))):
-        assert answer("run", sequence, "--controller", controller, *words, "--out",
-                      tmp_path / controller)["verdict"] == "PASS"
-    assert describe_first_difference(tmp_path / "c", tmp_path / "builtin") == "none in 2150 rows" and not nodes_on(where)
+    words = ["run", write_file(tmp_path / "waves.toml", WAVES), "--controller"]
+    for more in (["builtin", "--out", tmp_path / "builtin"], ["c", "--bus", where, "--out", tmp_path / "c"]):
+        assert answer(*words, *more)["verdict"] == "PASS"
+    assert (describe_first_difference(tmp_path / "c", tmp_path / "builtin"), nodes_on(where)) == (
+        "none in 2150 rows", [])
 
 
 @needs_compiler
