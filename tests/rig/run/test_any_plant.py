@@ -64,13 +64,15 @@ def write_bench(folder: Path, **changes: str) -> Path:
     return write_file(folder / "trim.toml", BENCH)
 
 
-def test_an_ema_with_a_cia402_drive(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sequence", [pytest.param("preflight", marks=pytest.mark.slow), ""])
+def test_an_ema_with_a_cia402_drive(sequence: str, tmp_path: Path) -> None:
     """It passes the preflight of the EMA; faulty drives are found on the bench of the EHA (test_controllers.py)."""
-    result = play(tmp_path / "run", "preflight", "--bench", DRIVE / "ema.toml")
+    result = play(tmp_path / "run", sequence or write_file(tmp_path / "short.toml", SHORT), "--bench",
+                  DRIVE / "ema.toml")
     assert result.status == 0, result
     trace = Trace.read(tmp_path / "run")
     assert trace.signals == ("demand", "position", "current_demand", "motor_speed", "current", "load")
-    assert abs(trace.position[-1]) < 2e-5 and abs(trace.column("motor_speed")).max() > 100.0
+    assert abs(trace.position[-1] - trace.demand[-1]) < 2e-5 and abs(trace.column("motor_speed")).max() > 100.0
 
 
 @only_udp
