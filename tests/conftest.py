@@ -16,9 +16,9 @@ from long_tests import LONG_TESTS, LONGEST
 from plugin_bus import require_bus_kind
 from rig_command import STARTED, rig
 
-from plant.compile import _let_lanes_fill_registers
+from plant.compile import _set_up_llvm
 
-_let_lanes_fill_registers()  # before a test gives numba a function of its own: numba reads that setting once
+_set_up_llvm()  # before a test gives numba a function of its own: numba reads that setting once
 
 pytest_plugins = ["plugin_bus", "pytester"]
 

@@ -491,6 +491,6 @@ class History:
 
     def column(self, name: str, phase: int | None = None) -> Array:
         """All cycles, or those of one phase. Raises ValueError for a name that is no field."""
-        table = np.frombuffer(self._numbers).reshape(-1, len(self._fields))
-        column: Array = table[:, self._fields.index(name)]
-        return column.copy() if phase is None else column[table[:, 0] == phase]  # no view: it would pin the buffer
+        # slices are copies: of an array that something still has a view of, a debugger perhaps, no cycle can be kept
+        column: Array = np.array(self._numbers[self._fields.index(name)::len(self._fields)])
+        return column if phase is None else column[np.array(self._numbers[::len(self._fields)]) == phase]
