@@ -284,7 +284,7 @@ def compile_function(function: Function, ports: Mapping[str, Function] | None = 
 
 @cache
 def _set_up_llvm() -> None:
-    """Have LLVM make vector code of loops of eight turns, in registers of 512 bits where the CPU has them, without delay.
+    """Have LLVM make vector code of loops of eight turns, in registers of 512 bits where the CPU has them.
 
     It leaves loops of fewer than 16 turns alone, as one of unknown size might not earn what goes before it. And it
     prefers 256 bits on most of these CPUs, as few wide operations slow down all that is around them; here all are wide.

@@ -25,8 +25,8 @@ _NUMBER = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER})\s*-\s*({_NUMBER})\s*([^,;:]*)")
 
 
-def find_starts(effect: Effect, command: Array, load: Array | None = None, plant: str = "eha"
-                ) -> tuple[Mapping[str, float], ...]:
+def find_starts(effect: Effect, command: Array, load: Array | None = None, plant: str = "eha",
+                beside: Sequence[str] = ()) -> tuple[Mapping[str, float], ...]:
     """Values of all fitted parameters to start from: the effect's own, or found from its ranges and its visibility.
 
     A parameter that says in what range it is typical ("0.2-5 kN") starts at both ends and between. Of one that says
@@ -37,6 +37,7 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None, plant
         command: (n,) demand, one a cycle.
         load: (n,) external load; none by default.
         plant: that has the effect.
+        beside: effects that the model has too, at their off values: the kernel for all of them makes the runs.
 
     Returns:
         Starts, "group.field" to SI value; none when nothing can be seen over this command.
@@ -48,7 +49,7 @@ def find_starts(effect: Effect, command: Array, load: Array | None = None, plant
         return effect.starts
     usual = {name: effect.off.get(name, find_plant(plant).nominal.get(name, 0.0)) for name in effect.fitted}
     sized = {name: sizes for name, off in usual.items()
-             if (sizes := _find_sizes(effect, name, off, command, load, plant))}
+             if (sizes := _find_sizes(effect, name, off, command, load, plant, beside))}
     starts = [usual | {name: size} for name, sizes in sized.items() for size in sizes]
     for name, value in usual.items():
         if name not in sized:
@@ -73,7 +74,8 @@ def lacks_starts(effect: Effect, kind: Plant) -> bool:
             and not kind.shared_starts and effect.name not in kind.effects)
 
 
-def ensure_starts(name: str, command: Array, load: Array | None = None, plant: str = "eha") -> Effect:
+def ensure_starts(name: str, command: Array, load: Array | None = None, plant: str = "eha",
+                  beside: Sequence[str] = ()) -> Effect:
     """The effect of that name; its plant has the start values from now on (see `find_starts`).
 
     `command` and `load`, (n,) each, are those of the run that is to show the effect.
@@ -82,27 +84,29 @@ def ensure_starts(name: str, command: Array, load: Array | None = None, plant: s
     effect = kind.find_effect(name)
     if lacks_starts(effect, kind):
         find = _resize_starts if effect.starts else find_starts
-        effect = replace(effect, starts=find(effect, command, load, plant) or effect.starts)
+        effect = replace(effect, starts=find(effect, command, load, plant, beside) or effect.starts)
         kind.replace_effect(effect)
     return effect
 
 
-def _resize_starts(effect: Effect, command: Array, load: Array | None, plant: str) -> tuple[Mapping[str, float], ...]:
+def _resize_starts(effect: Effect, command: Array, load: Array | None, plant: str, beside: Sequence[str]
+                   ) -> tuple[Mapping[str, float], ...]:
     """Starts of an effect that has those of another plant: sizes that this one shows, and what it shows of the others.
 
     A deviation of the controlled signal, or of its demand, is at most a tenth of the largest demand.
     """
     unhinted = {name: q._replace(typical="") for name, q in effect.parameters.items()}  # typical of the other plant
-    starts = find_starts(replace(effect, starts=(), parameters=unhinted), command, load, plant)
-    levels = compute_levels(compute_changes(effect, effect.starts, command, load, plant), plant).max(axis=1)
+    starts = find_starts(replace(effect, starts=(), parameters=unhinted), command, load, plant, beside)
+    changes = compute_changes(effect, effect.starts, command, load, plant, beside=beside)
+    levels = compute_levels(changes, plant).max(axis=1)
     starts += tuple(start for start, level in zip(effect.starts, levels, strict=True) if VISIBLE[0] <= level < np.inf)
     unit, most = find_plant(plant).signals.controlled.unit, 0.1 * np.abs(command).max()
     return tuple(start for start in starts
                  if all(abs(x) <= most for name, x in start.items() if effect.parameters[name].unit == unit))
 
 
-def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], command: Array,
-            load: Array | None = None, plant: str = "eha", anchor: float = ANCHOR) -> Array:
+def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], command: Array, load: Array | None = None,
+                    plant: str = "eha", anchor: float = ANCHOR, beside: Sequence[str] = ()) -> Array:
     """How an effect changes the signals of the nominal plant, driven by the same drive, without noise.
 
     An effect in the firmware changes no plant: then the first column is its drive over the loop's gain when it sees the
@@ -115,15 +119,15 @@ def compute_changes(effect: Effect, values: Sequence[Mapping[str, float]], comma
         load: (n,) external load.
         plant: whose signals they are.
         anchor: 1/s, at which the plant is drawn to the position of the nominal one.
+        beside: as for `find_starts`.
 
     Returns:
         (m, n, outputs): change of each output; of the EHA XJ m, P12 Pa, XS m.
     """
-    bare = build_bare_model(plant)
-    bare = bare.replace({s.noise: 0.0 for s in bare.kind.signals.outputs if s.noise})
-    force = np.zeros_like(command) if load is None else load
-    run, signals = simulate(bare, command, force), bare.kind.signals
-    model = bare if effect.base else bare.with_effects([effect.name])
+    signals, force = find_plant(plant).signals, np.zeros_like(command) if load is None else load
+    bare = build_bare_model(plant).replace({s.noise: 0.0 for s in signals.outputs if s.noise})
+    run = simulate(bare, command, force)
+    model = bare.with_effects([effect.name, *beside])  # one of the plant's own parameters adds nothing
     outputs = np.column_stack([getattr(run, s.name) for s in signals.outputs])
     if effect.firmware:
         return _compute_firmware_changes(model, values, command, outputs)
@@ -159,12 +163,13 @@ def _compute_firmware_changes(model: Model, values: Sequence[Mapping[str, float]
     return (out[1:] - out[:1]) / model.values.get("controller.proportional_gain", 1.0)
 
 
-def _find_sizes(effect: Effect, name: str, off: float, command: Array, load: Array | None, plant: str) -> list[float]:
+def _find_sizes(effect: Effect, name: str, off: float, command: Array, load: Array | None, plant: str,
+                beside: Sequence[str]) -> list[float]:
     """Values of one parameter, on either side of its off value, that can be seen with the others as usual."""
     quantity = effect.parameters[name]
 
     def find_highest_level(values: Array) -> Array:
-        change = compute_changes(effect, [{name: float(x)} for x in values], command, load, plant)
+        change = compute_changes(effect, [{name: float(x)} for x in values], command, load, plant, beside=beside)
         highest: Array = compute_levels(change, plant).max(axis=1)
         return highest
 

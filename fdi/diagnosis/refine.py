@@ -797,7 +797,7 @@ def find_effects_beside(model: Model, trace: Trace, alone: Refinement, floor: Ma
     problem = make_problem(model, trace, floor, workers, faults)
     problem = replace(problem, bare=problem.model, model=complete_model(problem.model), _lanes={})
     for name in (e.name for e in list_searched_effects(model.plant) if e.fitted and e.port not in UNREPLAYED):
-        ensure_starts(name, trace.command, trace.load, model.plant)  # where the file of a user's plant gives none
+        ensure_starts(name, trace.command, trace.load, model.plant, problem.model.effects)  # where its file gives none
     search = JointSearch(problem, list_other_effects(model, faults), progress)
     hypotheses = search.find_explanations(alone.fit)
     return average_explanations([_explain(h, search.problem, whole) for h in hypotheses], marks)

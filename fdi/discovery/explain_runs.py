@@ -145,20 +145,19 @@ def prepare_effects(runs: Runs, effects: Sequence[str] | None = None, progress: 
         InputError: a user's effect that cannot be compiled and run, or a plant whose equations cannot be read.
     """
     runs.model.kind.require_equations()
-    for name in [e.name for e in list_searched_effects(runs.model.plant)] if effects is None else effects:
-        if lacks_starts(runs.model.find_effect(name), runs.model.kind):
-            progress(f"looking for sizes of {name}", 0.0)
-            ensure_starts(name, runs.est.command, runs.est.load, runs.model.plant)
-    if effects is None:
-        whole_model = complete_model(runs.model)
-        with report_law_errors(whole_model):
-            compile_kernels(whole_model, lambda stage, share: progress(stage, 0.0))
-        return
-    replay_effects = [name for name in effects if runs.model.find_effect(name).port not in UNREPLAYED]
-    model = lean_model(runs.model, replay_effects)
+    names = [e.name for e in list_searched_effects(runs.model.plant)] if effects is None else effects
+    replay_effects = [name for name in names if runs.model.find_effect(name).port not in UNREPLAYED]
+    model = complete_model(runs.model) if effects is None else lean_model(runs.model, replay_effects)
     with report_law_errors(model):
-        progress("compiling the plant with it, once", 0.0)
-        _compile_kernels(model, replay_effects)
+        if effects is None:
+            compile_kernels(model, lambda stage, share: progress(stage, 0.0))
+        for name in names:
+            if lacks_starts(runs.model.find_effect(name), runs.model.kind):
+                progress(f"looking for sizes of {name}", 0.0)
+                ensure_starts(name, runs.est.command, runs.est.load, runs.model.plant, model.effects)
+        if effects is not None:
+            progress("compiling the plant with it, once", 0.0)
+            _compile_kernels(model, replay_effects)
 
 
 def lean_model(model: Model, effects: Sequence[str]) -> Model:
