@@ -63,7 +63,6 @@ from .model import (
     find_plant_of_model as find_plant_of_model,
     find_quantity as find_quantity,
     find_shipped_model as find_shipped_model,
-    list_offered_effects as list_offered_effects,
     list_searched_effects as list_searched_effects,
     load_model as load_model,
     parse_model as parse_model,

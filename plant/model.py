@@ -26,14 +26,9 @@ from plant.tables import quote_text
 SHIPPED_MODELS = ("servo", "emps")  # plant/models/NAME.toml, beside the nominal values of the plants
 
 
-def list_offered_effects(plant: str = "eha") -> list[Effect]:
-    """The effects of the catalogue that suit a plant."""
-    return find_plant(plant).list_effects()
-
-
 def list_searched_effects(plant: str = "eha") -> list[Effect]:
     """The effects that `rig explain` tests on a plant without being asked."""
-    return [e for e in list_offered_effects(plant) if not e.searched_in or plant in e.searched_in]
+    return [e for e in find_plant(plant).list_effects() if not e.searched_in or plant in e.searched_in]
 
 
 def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Quantity:
@@ -43,7 +38,7 @@ def find_quantity(name: str, where: object = "--set", plant: str = "eha") -> Qua
         InputError: there is no such parameter.
     """
     group = name.partition(".")[0]  # of parameters too, where a plant calls an effect by it
-    own = {e.name: e.fitted for e in list_offered_effects(plant) if e.base}.get(group)
+    own = {e.name: e.fitted for e in find_plant(plant).list_effects() if e.base}.get(group)
     require(not own or group in find_plant(plant).parameters, where, name,
             f"{' or '.join(own or ())}: the parameter that this effect is in this plant")
     return find_field(where, name, find_plant(plant).list_groups())
@@ -250,7 +245,7 @@ def parse_model(tables: Mapping[str, Any], where: object, name: str = "eha") -> 
     design = tables.pop("design", {})
     require(isinstance(name, str) and name, where, "name", f"a text, not {name!r}")
     plant = _find_plant(plant_entry, where)
-    names = [e.name for e in list_offered_effects(plant)]  # a list, as what stands in a file need not be hashable
+    names = [e.name for e in find_plant(plant).list_effects()]  # a list, as what stands in a file need not be hashable
     unknown = [e for e in effects if e not in names] if isinstance(effects, list) else [effects]
     if unknown:
         hint = suggest_name(str(unknown[0]), names)
@@ -282,7 +277,7 @@ def find_effect(name: str, plant: str = "eha") -> Effect:
     Raises:
         InputError: there is none of that name.
     """
-    effects = {e.name: e for e in list_offered_effects(plant)}
+    effects = {e.name: e for e in find_plant(plant).list_effects()}
     if name not in effects:
         hint = suggest_name(name, effects, 0.5) or " (rig effects lists them)"
         hint = f" that suits the plant {plant}" if name in CATALOGUE.list_all() else hint

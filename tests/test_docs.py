@@ -27,7 +27,7 @@ from reference_pages import write_reference
 from rig_command import rig, write_file
 from short_runs import HIDDEN, write_measured_runs
 
-from plant import Input, Model, list_offered_effects, list_plants, load_model, simulate
+from plant import Input, Model, find_plant, list_plants, load_model, simulate
 from plant.effects import effect, load_effects
 from plant.eha import State
 from plant.parameters import GROUPS
@@ -275,7 +275,7 @@ def test_the_page_of_a_command_has_what_its_help_has(
 
 def test_the_reference_has_every_effect_key_and_kind(reference: Path) -> None:
     sections = re.findall(r"^##+ (.*)", (reference / "effects.md").read_text(), re.MULTILINE)
-    assert {effect.name for plant in list_plants() for effect in list_offered_effects(plant)} == set(sections)
+    assert {effect.name for plant in list_plants() for effect in find_plant(plant).list_effects()} == set(sections)
     sections = re.findall(r"^##+ (.*)", (reference / "sequences.md").read_text(), re.MULTILINE)
     for word, kinds in (("Segment", SEGMENT_KINDS), ("Fault", faults.KINDS), ("Check", KINDS)):
         assert {f"{word} {name}" for name in kinds} <= set(sections)

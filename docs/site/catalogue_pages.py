@@ -6,7 +6,7 @@ from typing import Any
 
 from markdown_text import MADE, escape_markup, make_table, name_anchor, quote_code
 
-from plant import Model, list_offered_effects, list_plants, load_model
+from plant import Model, find_plant, list_plants, load_model
 from plant.effects import Effect
 from rig.cli.commands import list as list_command
 
@@ -15,7 +15,7 @@ def write_effect_page() -> list[str]:
     """The page of the catalogue."""
     found: dict[str, tuple[Effect, str]] = {}  # of one name, that of the first plant
     for plant in list_plants():
-        for e in list_offered_effects(plant):
+        for e in find_plant(plant).list_effects():
             found.setdefault(e.name, (e, plant))
     effects = [e for e, _ in found.values()]
     rows = [(f"[{e.name}](#{name_anchor('effect', e.name)})", e.port or "reference model", quote_code(e.law))

@@ -38,7 +38,6 @@ from plant import (
     find_effect,
     find_plant,
     find_quantity,
-    list_offered_effects,
     list_plants,
     parse_model,
     quote_text,
@@ -189,7 +188,7 @@ def check_addable(model: Model, effects: Sequence[str]) -> None:
     """
     present = list(list_active_effects(model))
     for name in effects:
-        require(name in [e.name for e in list_offered_effects(model.plant)], "effect", name,
+        require(name in [e.name for e in model.kind.list_effects()], "effect", name,
                 f"an effect that the plant {model.plant} can have")
         entry = model.find_effect(name)
         require(name not in present, "effect", name,

@@ -32,7 +32,6 @@ from plant import (
     Plant,
     build_bare_model,
     find_quantity,
-    list_offered_effects,
     list_searched_effects,
     map_in_threads,
     simulate,
@@ -358,7 +357,7 @@ def turn_amplitudes_positive(free: Sequence[Free], x: Floats, effects: Iterable[
 
 def list_active_effects(model: Model) -> tuple[str, ...]:
     """Effects at work in a model; those of the reference model if no healthy unit could be so far off nominal."""
-    return tuple(e.name for e in list_offered_effects(model.plant)
+    return tuple(e.name for e in model.kind.list_effects()
                  if (_is_off_nominal(e, model) if e.base else e.name in model.effects and e.is_active(model.values)))
 
 

@@ -42,7 +42,6 @@ from plant import (
     count_threads,
     find_effect,
     find_quantity,
-    list_offered_effects,
     load_nominal_values,
     load_plant,
     parse_model,
@@ -182,7 +181,7 @@ def _find_size(key: str, model: Model, faults: Sequence[Fault]) -> tuple[str, Qu
         InputError: neither a fault nor an effect, or an effect without a size.
     """
     own = {fault.parameter: fault.name for fault in faults}
-    effects = {e.name: (*e.fitted, "")[0] for e in list_offered_effects(model.plant)}
+    effects = {e.name: (*e.fitted, "")[0] for e in model.kind.list_effects()}
     parameters = {**dict(zip(own, own, strict=True)), **effects, **{name: first for first, name in own.items()}}
     require(key in parameters, "", key, f"a fault ({', '.join(own.values())}) or an effect of the catalogue"
             f"{suggest_name(key, parameters, 0.5) or ' (rig effects lists them)'}")

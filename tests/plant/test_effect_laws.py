@@ -14,8 +14,8 @@ from plant import (
     Input,
     Model,
     compute_answers,
+    find_plant,
     interpret_function,
-    list_offered_effects,
     simulate,
     unpack_state,
 )
@@ -370,7 +370,7 @@ def build(name: str, value: float) -> tuple[Model, object, Line]:
 
 
 def test_explain_does_not_search_them_and_each_has_a_source() -> None:
-    assert not set(WEAR) & {*CATALOGUE, *(e.name for e in list_offered_effects("ema"))}
+    assert not set(WEAR) & {*CATALOGUE, *(e.name for e in find_plant("ema").list_effects())}
     assert all(CATALOGUE[name].source and CATALOGUE[name].revealed_by for name in WEAR)
 
 

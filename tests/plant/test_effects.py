@@ -23,7 +23,6 @@ from plant import (
     ensure_starts,
     find_plant,
     find_quantity,
-    list_offered_effects,
     load_nominal_values,
     simulate,
 )
@@ -311,7 +310,7 @@ def test_the_trial_of_an_effect_that_does_not_show(file: Path) -> None:
 
 def test_the_catalogue_is_told_for_machines() -> None:
     rows = {row["effect"]: row for row in answer("effects")["effects"]}
-    assert set(rows) == {effect.name for effect in list_offered_effects()}
+    assert set(rows) == {effect.name for effect in find_plant("eha").list_effects()}
     assert rows["coil_lag"]["confused_with"] == ["transport_delay", "sensor_lag"]
     assert rows["spool_overlap"]["excludes"] == ["spool_underlap"] and rows["spool_overlap"]["starts"]
     assert rows["command_rate_limit"]["in_firmware"] and "self_test" not in rows["command_rate_limit"]

@@ -22,7 +22,7 @@ from plant import (
     compute_flow_balance,
     compute_force_balance,
     find_key,
-    list_offered_effects,
+    find_plant,
     list_plants,
     list_searched_effects,
     load_model,
@@ -432,7 +432,7 @@ def test_general_effects_suit_every_plant_and_act_and_are_searched_in_this_one(n
     """
     e, model = CATALOGUE[name], load_model(plant).replace({"quantisation.lsb": 0.0})
     assert e.law and e.symptoms and e.source and e.function.__doc__
-    assert e in list_offered_effects(plant) and (e in list_searched_effects(plant)) == (plant == "ehs")
+    assert e in find_plant(plant).list_effects() and (e in list_searched_effects(plant)) == (plant == "ehs")
     command = np.r_[np.full(15, 1e-3), np.full(15, -1e-3)]
     strong = {parameter: 2.0 * value for parameter, value in e.starts[-1].items()}
     off, on, without = (np.array(simulate(m, command, steps=4, fast=False))

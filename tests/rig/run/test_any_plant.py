@@ -66,7 +66,7 @@ def write_bench(folder: Path, **changes: str) -> Path:
 
 @pytest.mark.parametrize("sequence", [pytest.param("preflight", marks=pytest.mark.slow), ""])
 def test_an_ema_with_a_cia402_drive(sequence: str, tmp_path: Path) -> None:
-    """It passes the preflight of the EMA; faulty drives are found on the bench of the EHA (test_controllers.py)."""
+    """It passes a step, and the whole preflight (slow); test_controllers.py has faulty drives."""
     result = play(tmp_path / "run", sequence or write_file(tmp_path / "short.toml", SHORT), "--bench",
                   DRIVE / "ema.toml")
     assert result.status == 0, result
