@@ -225,10 +225,10 @@ BARE = re.sub("(setup|cleanup) .*", "", SHORT).replace('"ramp", to = 0.0, time =
 
 
 @pytest.mark.parametrize(("folder", "text"), [
-    (DRIVE, SHORT + SLOW_START), (ECU, ""), (ECU, BARE), (ECU, BARE.replace("0.03 ", "0.031 ")),
-    (ECU, BARE + "[protocol]\nprobe = false\n")])
+    (DRIVE, SHORT + SLOW_START), pytest.param(ECU, "", marks=pytest.mark.slow), (ECU, BARE),
+    (ECU, BARE.replace("0.03 ", "0.031 ")), (ECU, BARE + "[protocol]\nprobe = false\n")])
 def test_a_sequence_passes_in_lockstep(tmp_path: Path, folder: Path, text: str) -> None:
-    """The drive passes a whole preflight in test_any_plant.py, if slow tests are asked for."""
+    """Both pass a whole preflight, the drive in test_any_plant.py, if slow tests are asked for."""
     words = (write_file(tmp_path / "short.toml", text),) if text else ()  # preflight
     result = run_bench(folder, spec("udp_multicast"), tmp_path, *words, options=PATIENT[folder])
     assert (result.status, result.json["verdict"], list_failed(result)) == (0, "PASS", [])
