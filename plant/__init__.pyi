@@ -41,7 +41,7 @@ from .kernels import (
     unpack_state as unpack_state,
 )
 from .lanes import (
-    NARROW as NARROW,
+    WIDEST as WIDEST,
     Lanes as Lanes,
     Part as Part,
     compile_kernels as compile_kernels,

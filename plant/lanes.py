@@ -52,7 +52,7 @@ FEW_COSTLY = 2  # costly effects that a kernel of their own may have
 ALL_OVER_FEW = 4.0  # time of a step with all effects over that of one with few costly ones
 WIDTH = 16  # lanes: this stands for a layout's own, which is put in its place
 # one of the widest registers, or two, so that one computes while the other waits
-NARROW, WIDE = 8, 16
+NARROWEST, WIDEST = 8, 16
 TURN = 20_000  # samples that a kernel makes in one call
 KERNEL_USE = KernelUse()  # of this process
 
@@ -355,7 +355,7 @@ class Lanes:
             if not is_few or ALL_OVER_FEW * fewer <= _count_blocks(sizes[kind]):
                 continue
             kernel = self._find_own_kernel((*cheap, *(costly[i] for i in np.flatnonzero(kinds[kind]))))
-            if kernel.is_ready(NARROW * _count_blocks(sizes[kind]) * samples * self.steps):
+            if kernel.is_ready(NARROWEST * _count_blocks(sizes[kind]) * samples * self.steps):
                 assignments.append((kernel, members[is_of_kind]))
                 is_left &= ~is_of_kind
         if is_left.any():
@@ -393,7 +393,7 @@ class KernelVariant:
         # a model of few effects makes too few runs to be worth the seconds in which a second layout is compiled
         is_waiting = all(_is_cheap(model.find_effect(name)) for name in effects)
         makes_many = not effects or len(model.effects) > FEW
-        self.widths = (NARROW, WIDE) if is_waiting and makes_many else (NARROW,)
+        self.widths = (NARROWEST, WIDEST) if is_waiting and makes_many else (NARROWEST,)
 
     def is_ready(self, steps: float) -> bool:
         """Whether the kernel can make so many steps of all lanes now: see `KernelUse.is_ready`."""
@@ -439,7 +439,7 @@ class KernelVariant:
 
 
 def _count_blocks(runs: int) -> int:
-    return -(-int(runs) // NARROW)
+    return -(-int(runs) // NARROWEST)
 
 
 def list_kernel_variants(model: Model) -> list[KernelVariant]:
@@ -508,7 +508,7 @@ state_at = parameters_at = coefficients_at = loop_at = drive_at = raise_unbound
 keep_state = keep_coefficients = keep_loop = keep_drive = raise_unbound
 
 
-def plan_layout(effects: tuple[str, ...], kind: Plant, record: np.dtype[Any], width: int = WIDE) -> Layout:
+def plan_layout(effects: tuple[str, ...], kind: Plant, record: np.dtype[Any], width: int = WIDEST) -> Layout:
     """The layout for a plant with `effects` and parameters in a `record`, `width` lanes."""
     functions, place = kind.bind_functions(effects), 0
     p = build_bare_model(kind.key).with_effects(effects).build_record()[0]

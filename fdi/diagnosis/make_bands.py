@@ -53,7 +53,7 @@ from fdi.thresholds import (
     STEP_FAULT_LEAVES_SD,
 )
 from fdi.trace import Floats, Section, Trace, fill_gaps, find_sections, measure_scale
-from plant import NARROW, Lanes, Model, count_nouns, count_threads, load_model, require
+from plant import WIDEST, Lanes, Model, count_nouns, count_threads, load_model, require
 
 FRICTION_AMOUNTS = (2, 5, 10, 14)  # sevenths of MaxBand, beside both limits
 LOW_DYNAMIC_SHARE = 0.3  # of the usual dynamic friction, of units that slip easily
@@ -416,15 +416,15 @@ def simulate_units(model: Model, com: Floats, load: Floats, changes: Mapping[str
     out = np.empty((count, len(com)))
 
     def simulate_block(first: int) -> None:
-        members = slice(first, min(first + NARROW, count))
+        members = slice(first, min(first + WIDEST, count))
         rng = np.random.default_rng([seed, first])
-        before = com[0] + lead_in if com[0] != 0.0 or first // NARROW % 2 else com[:0]
+        before = com[0] + lead_in if com[0] != 0.0 or first // WIDEST % 2 else com[:0]
         noise = sample_sensor_noise(rng, model, len(before) + len(com))
         units = _sample_parameters(rng, model, tolerance, names, changes)[:members.stop - first]
         demand, force = np.r_[before, com] - noise, np.r_[np.full(len(before), load[0]), load]
         out[members] = (lanes.closed_loop(units, demand, force)[..., 0] + noise)[:, len(before):]
 
-    starts = range(0, count, NARROW)
+    starts = range(0, count, WIDEST)
     with ThreadPoolExecutor(count_threads()) as pool:
         for done, _ in enumerate(pool.map(simulate_block, starts)):
             progress(f"simulating units, {name}", (done + 1) / len(starts))
@@ -463,10 +463,10 @@ def colour_noise(white: Floats, colour: float) -> Floats:
 
 def _sample_parameters(rng: np.random.Generator, model: Model, tolerance: Mapping[str, float], names: list[str],
                        changes: Mapping[str, float]) -> Floats:
-    """Parameters of a block of units, (NARROW, len(names))."""
-    table = np.tile([model[name] for name in names], (NARROW, 1))
+    """Parameters of a block of units, (WIDEST, len(names))."""
+    table = np.tile([model[name] for name in names], (WIDEST, 1))
     for name, size in tolerance.items():
-        table[:, names.index(name)] += size * rng.standard_normal(NARROW)
+        table[:, names.index(name)] += size * rng.standard_normal(WIDEST)
     for name, value in changes.items():
         table[:, names.index(name)] = value
     return limit_dynamic_friction(names, table)

@@ -32,7 +32,7 @@ from plant import (
 )
 from plant.effects import CATALOGUE, load_effects
 from plant.kernel_use import KernelUse
-from plant.lanes import NARROW, plan_layout
+from plant.lanes import NARROWEST, plan_layout
 from plant.solve import pull_plant, rest_at_reading
 from rig.sequences import load_sequence
 
@@ -219,10 +219,10 @@ def test_what_does_not_fit_is_refused() -> None:
 def test_wide_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lanes of the step became vector code, as a loop or at once: nothing in the step stops it."""
     monkeypatch.setenv("EHA_RIG_CACHE", str(tmp_path))  # what comes from the cache cannot be read as assembly
-    plan = plan_layout((), Model().kind, Model().build_record().dtype, NARROW)
+    plan = plan_layout((), Model().kind, Model().build_record().dtype, NARROWEST)
     run = compile_function(plan.loop, plan.names)
-    run(np.zeros(plan.numbers * NARROW), CURRENT, FORCE, np.empty(0), 0.0, 0.0, False, 1e-3, 10,
-        0, len(CURRENT), 0, 0, True, np.arange(NARROW, dtype=np.uint64), np.empty((NARROW, 3, len(CURRENT))))
+    run(np.zeros(plan.numbers * NARROWEST), CURRENT, FORCE, np.empty(0), 0.0, 0.0, False, 1e-3, 10,
+        0, len(CURRENT), 0, 0, True, np.arange(NARROWEST, dtype=np.uint64), np.empty((NARROWEST, 3, len(CURRENT))))
     (code,) = run.inspect_asm().values()
     pieces = re.split(r"^\.LBB\w+:\n", code, flags=re.MULTILINE)  # without a jump
     step = max(pieces, key=lambda piece: len(re.findall("%[yz]mm", piece)))

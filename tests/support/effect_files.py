@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from unittest.mock import patch
 
 from plant.effects import CATALOGUE
 
@@ -52,12 +54,10 @@ def wear(x, m, s, u, p):
 
 @contextmanager
 def restored_catalogue(*effects: str) -> Iterator[None]:
-    """Takes out again what was registered meanwhile; with only these `effects`, if any are named: a short search."""
-    before = dict(CATALOGUE)
-    for name in set(CATALOGUE) - set(effects or CATALOGUE):
-        del CATALOGUE[name]
-    try:
+    """Takes out again what was registered meanwhile; with only these `effects` searched, if any are named.
+
+    The others stay in the catalogue: kernels have the parameters of all, so those of other tests serve here too.
+    """
+    others = set(CATALOGUE) - set(effects or CATALOGUE)
+    with patch.dict(CATALOGUE, {name: replace(CATALOGUE[name], searched_in=("nowhere",)) for name in others}):
         yield
-    finally:
-        CATALOGUE.clear()
-        CATALOGUE.update(before)
