@@ -460,7 +460,7 @@ def compile_kernels(model: Model, progress: Callable[[str, float], None] = lambd
     """Compile the kernels that runs of the model may need, or load them from the cache.
 
     `progress` is called with each stage and the share done.
-    The first time this takes some 2 s without effects and 15 s with the whole catalogue, later half a second.
+    The first time this takes some 2 s without effects and 12 s with the whole catalogue, later half a second.
     """
     variants = list_kernel_variants(model)
     for done, variant in enumerate(variants):

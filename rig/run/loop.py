@@ -491,6 +491,6 @@ class History:
 
     def column(self, name: str, phase: int | None = None) -> Array:
         """All cycles, or those of one phase. Raises ValueError for a name that is no field."""
-        # slices are copies: of an array that something still has a view of, a debugger perhaps, no cycle can be kept
+        # slices are copies: while anything, a debugger perhaps, holds a view of the array, no cycle can be appended
         column: Array = np.array(self._numbers[self._fields.index(name)::len(self._fields)])
         return column if phase is None else column[np.array(self._numbers[::len(self._fields)]) == phase]
