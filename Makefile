@@ -10,9 +10,11 @@ ARGS   ?=
 # one more than there are CPUs: tests of programs on a bus wait for half of their time
 WORKERS ?= $(shell expr $$(nproc) + 1)
 BIN    := $(VENV)/bin
-# uv, where it is there, installs in a third of the time
-UV     := $(shell command -v uv)
-PIP    := $(if $(UV),$(UV) pip install -q --python $(BIN)/python,$(BIN)/python -m pip --disable-pip-version-check install -qq)
+EXTRAS := dev,docs,view,plots,fleet,learn,measure,fmu,shell
+# uv, where it is there, installs in a third of the time; pip does where uv cannot, as with a mirror that pip alone knows
+UV     := $(shell command -v uv 2>/dev/null)
+install = { test -n "$(UV)" && "$(UV)" pip install -q --python $(BIN)/python -e '$(1)'; } || \
+  $(BIN)/python -m pip --disable-pip-version-check install -qq -e '$(1)'
 MADE   := $(VENV)/.made
 # with it each program that a test starts would compile the whole rig again (1.5 s)
 unexport PYTHONDONTWRITEBYTECODE
@@ -76,10 +78,10 @@ $(MADE):
 
 $(VENV)/.run: pyproject.toml $(MADE)
 	@echo "== installing what the bench needs into $(VENV) (once, about a minute)"
-	@$(PIP) -e .
+	@$(call install,.)
 	@touch $@
 
 $(VENV)/.test: pyproject.toml $(MADE)
 	@echo "== installing what the tests and the viewer need into $(VENV) (once, about two minutes)"
-	@$(PIP) -e '.[dev,docs,view,plots,fleet,learn,measure,fmu,shell]'
+	@$(call install,.[$(EXTRAS)])
 	@touch $@ $(VENV)/.run
