@@ -31,6 +31,7 @@ from rig.benches import (
     pack,
     unpack,
 )
+from studies.command import start_parser
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 NUMBERS = ("0", "1", "-1", "7", "8", "64", "65", "127", "128", "255", "256", "0xFFFFFFFF", "0x80000000", "0x20000000",
@@ -150,7 +151,7 @@ def run_trials(count: int, seed: int) -> Iterator[tuple[int, Mapping[str, bytes]
         yield number, files, try_files(files)
 
 
-def main(count: int = 100_000, seed: int = 1) -> int:
+def main(count: int, seed: int) -> int:
     """Print how many were loaded, refused and failed, the failures, and the times."""
     kinds: Counter[str] = Counter()
     seconds = []
@@ -172,4 +173,7 @@ def main(count: int = 100_000, seed: int = 1) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*map(int, sys.argv[1:])))
+    parser = start_parser("studies.bench_mutations", __doc__)
+    parser.add_argument("count", type=int, nargs="?", default=100_000, help="trials (default 100,000)")
+    parser.add_argument("seed", type=int, nargs="?", default=1, help="default 1")
+    sys.exit(main(**vars(parser.parse_args())))

@@ -26,7 +26,7 @@ def run_study_command(name: str, text: str | None, arguments: Sequence[str] | No
         add_options: adds the study's own options to --seed, --json, --quiet and --out FILE.json.
         run: from the options to the report and whether the study met its aims.
     """
-    parser = argparse.ArgumentParser(prog=f"python -m {name}", description=(text or "").splitlines()[0])
+    parser = start_parser(name, text)
     add_options(parser)
     parser.add_argument("--seed", type=parse_whole_number, default=0, metavar="N", help="seed (default 0)")
     parser.add_argument("--json", action="store_true", help="print one JSON object on standard output, nothing else")
@@ -40,6 +40,11 @@ def run_study_command(name: str, text: str | None, arguments: Sequence[str] | No
     except RigError as error:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return error.status
+
+
+def start_parser(name: str, text: str | None) -> argparse.ArgumentParser:
+    """A parser for the module `name`; the first line of its docstring `text` is the description."""
+    return argparse.ArgumentParser(prog=f"python -m {name}", description=(text or "").splitlines()[0])
 
 
 def report_progress(stage: str, share: float) -> None:

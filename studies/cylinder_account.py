@@ -2,8 +2,8 @@
 
     python -m studies.cylinder_account FOLDER --model FILE.toml
 
-FOLDER holds m_find_b_pA_1V_sample_1.mat and the other files of the trainer (docs/real_data.md), which are imported with
-the maps of examples/servovalve_cylinder. Force and speed are means over the middle half of the stroke.
+FOLDER holds m_find_b_pA_1V_sample_1.mat and the other files of the trainer (docs/real_cylinder.md), which are imported
+with the maps of examples/servovalve_cylinder. Force and speed are means over the middle half of the stroke.
 """
 
 import argparse

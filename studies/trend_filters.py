@@ -1,18 +1,18 @@
 """Compare `rig trend` with two library filters on the same units.
 
-    pip install progpy filterpy; OPENBLAS_NUM_THREADS=1 python -m studies.trend_filters [UNITS OF EACH LAW]
+    pip install progpy filterpy; OPENBLAS_NUM_THREADS=1 python -m studies.trend_filters [COUNT]
 
 Both filters estimate the state (size x, rate a, curvature c) with x' = a + c x. They take each interval as the noise of
 its trace, and let a and c wander. Sizes are scaled to 1 at MaxBand, time to 100 days.
 """
 
-import sys
 import time
 import warnings
 from collections.abc import Callable
 
 import numpy as np
 
+from studies.command import start_parser
 from studies.prognosis import LAWS, Unit, predict_unit, simulate_unit
 
 PARTICLES, PARTS = 2000, (0.3, 0.5, 0.7, 0.9)
@@ -128,7 +128,9 @@ def format_score(name: str, method: Callable[[Unit, int], np.ndarray],
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    parser = start_parser("studies.trend_filters", __doc__)
+    parser.add_argument("count", type=int, nargs="?", default=5, help="units of each law of growth (default 5)")
+    count = parser.parse_args().count
     fleet_units = [simulate_unit(law, 5000 + 100 * i + k)
                    for i, law in enumerate(LAWS) for k in range(count)]
     print("| method | 95 % to MaxBand | within 20 % | upper end / true | error of the median | a prediction |")

@@ -15,6 +15,7 @@ from fdi.report.diagnosis_report import draw_maps
 from fdi.report.drawing import shorten_svg
 from plant import Model, simulate
 from studies import paper_figures as figures
+from studies.command import start_parser
 
 HERE = Path(__file__).parent.parent / "docs" / "worked_cases"
 RIG = [sys.executable, "-m", "rig.cli.main"]
@@ -91,4 +92,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    start_parser("studies.worked_cases", __doc__).parse_args()
     main()

@@ -38,12 +38,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The longest first, so that no worker is left with one of them; leave out the long ones if --quick was given."""
+    """The longest first, so that no worker is left with one; slow ones with -m alone, no long ones if --quick."""
     places = (*LONGEST, "")
     items.sort(key=lambda item: [item.nodeid.removeprefix("tests/").startswith(place) for place in places].index(True))
+    for item in items:
+        if not config.getoption("-m") and item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.skip(reason="takes long; -m slow runs it"))
     if config.getoption("--quick"):
-        root = config.rootpath / "tests"
-        long = [item for item in items if item.path.relative_to(root).as_posix().startswith(LONG_TESTS)]
+        long = [item for item in items
+                if item.path.relative_to(config.rootpath / "tests").as_posix().startswith(LONG_TESTS)]
         config.hook.pytest_deselected(items=long)
         items[:] = [item for item in items if item not in set(long)]
 

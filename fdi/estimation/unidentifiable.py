@@ -84,7 +84,7 @@ FLAT_WITH_EFFECTS: tuple[Mapping[str, float], ...] = (
 # How far the spool moves: all that meets it moves with it. In a run in which it meets its stops the position shows it.
 SPOOL_WAY: Mapping[str, float] = {
     "valve.flow_gain": -1.0, "valve.pressure_gain": -1.0, "feedback_spring.stiffness": -1.0, "pilot.flow_gain": 1.0,
-    "spool_overlap.overlap": 1.0, "spool_underlap.underlap": 1.0, "feedback_gap.gap": 1.0,
+    "spool_overlap.overlap": 1.0, "spool_underlap.underlap": 1.0, "feedback_gap.width": 1.0,
     "flow_force.coefficient": -1.0}
 
 # The pressure across the piston, at the same forces on the ram.

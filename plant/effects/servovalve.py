@@ -19,12 +19,12 @@ def nozzle_asymmetry(x: float, s: Any, u: Any, p: Any) -> float:
 
 
 @effect("feedback", {  # Total play between the feedback spring's ball and its slot in the spool.
-    "gap": Quantity("m", low=0, high=1, typical="5-50 um"),
-}, law="KSF deadzone(XS, gap/2)", symptoms="limit cycle at null even with no friction", starts=(5e-6, 2e-5, 5e-5),
+    "width": Quantity("m", low=0, high=1, typical="5-50 um"),
+}, law="KSF deadzone(XS, width/2)", symptoms="limit cycle at null even with no friction", starts=(5e-6, 2e-5, 5e-5),
     source="ball wear of mechanical-feedback servovalves")
 def feedback_gap(x: float, s: Any, u: Any, p: Any) -> float:
     """The worn ball of the feedback wire feels the spool only beyond the gap."""
-    return soften(x, 0.5 * p.feedback_gap.gap)
+    return soften(x, 0.5 * p.feedback_gap.width)
 
 
 @effect("spool_force", {  # Steady flow force per spool displacement and pressure drop: 2 Cd Cv w cos(69 deg).

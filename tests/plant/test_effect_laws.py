@@ -105,7 +105,7 @@ def test_the_nozzles_gain_differs_by_direction(sign: float) -> None:
 
 
 def test_the_worn_ball_lets_the_spool_go_half_a_gap_further_and_hunt_at_null() -> None:
-    model = EASY.replace({"feedback_gap.gap": 20e-6})
+    model = EASY.replace({"feedback_gap.width": 20e-6})
     xs = drive_plant(model, np.full(100, 1e-3))[1][2]
     hunting, quiet = (np.std(simulate(m, np.r_[np.full(20, 1e-4), np.zeros(1500)]).xs[-500:]) for m in (model, EASY))
     assert xs[-1] == pytest.approx(measure_spool(model, 1e-3) + 10e-6, rel=1e-4) and hunting > 2e-6 > 1e-9 > quiet

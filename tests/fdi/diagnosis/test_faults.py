@@ -58,7 +58,8 @@ from plant.faults import place_fault
 from plant.segments import Ramp, Step
 from rig.campaign.judge import build_matrix, simulate_case
 
-GAP = {"title": "play", "parameter": "feedback_gap.gap", "range": [0.0, 5e-4], "acceptable": 4e-5, "maintenance": 9e-5}
+GAP = {"title": "play", "parameter": "feedback_gap.width", "range": [0.0, 5e-4], "acceptable": 4e-5,
+       "maintenance": 9e-5}
 EHA = find_plant("eha")
 
 
@@ -80,14 +81,14 @@ def test_the_papers_faults_are_a_file_with_the_limits_of_table_2() -> None:
 
 @pytest.mark.parametrize(("keys", "words"), [
     ({"parameter": "no.such"}, ["parameter", "plant eha"]),
-    ({"parameter": "feedback_gap.width"}, ["parameter", "(gap)"]),
+    ({"parameter": "feedback_gap.length"}, ["parameter", "(width)"]),
     ({"acceptable": 2e-4, "maintenance": 1e-4}, ["acceptable", "between"]),
     ({"maintenance": 1.0}, ["maintenance", "within the range"]),
     ({"acceptable": -1.0}, ["acceptable", "within the range"]),
     ({"range": [1e-5, 5e-4]}, ["range", "healthy size"]),
     ({"range": [-1.0, 1.0]}, ["range", "from 0 to 1 m"]),
     ({"range": [1.0]}, ["range", "[a number, a number]"]),
-    ({"unit": "mm"}, ["unit", "m, that of feedback_gap.gap"]),
+    ({"unit": "mm"}, ["unit", "m, that of feedback_gap.width"]),
     ({"mantenance": 1.0}, ["mantenance", "did you mean 'maintenance'?"]),
     ({"title": None}, ["also the key 'title'"]),
     ({"acceptable": "much"}, ["acceptable", "a number"]),
