@@ -135,8 +135,7 @@ def compute_pressure_force(values: Mapping[str, float], chambers: Array, cor: Ar
     a, b = (np.maximum(np.interp(rows + values[f"pressure_sensors.delay_{name}"] / period, rows, column), 0.0)
             for name, column in zip("ab", chambers.T, strict=True))
     last = np.maximum.accumulate(np.where(cor != 0.0, rows, 0))
-    force: Array = np.where(cor[last] < 0.0, -values["pump.area_ratio"] * b, a) * values["jack.area"]
-    return force
+    return np.asarray(np.where(cor[last] < 0.0, -values["pump.area_ratio"] * b, a) * values["jack.area"])
 
 
 def derive_logger_columns(sources: Mapping[str, Array]) -> dict[str, Array]:

@@ -177,8 +177,7 @@ def exp_of(x: NDArray[np.float64]) -> NDArray[np.float64]:
     n = np.rint(exponents * 1.4426950408889634)
     r = (exponents - n * 6.93147180369123816490e-01) - n * 1.90821492927058770002e-10
     half = np.rint(0.5 * n)
-    y: NDArray[np.float64] = np.ldexp(np.ldexp(_exp_series(r), half.astype(int)), (n - half).astype(int))
-    return y
+    return np.asarray(np.ldexp(np.ldexp(_exp_series(r), half.astype(int)), (n - half).astype(int)))
 
 
 IN_PLACE_OF: dict[Any, Any] = {

@@ -110,14 +110,11 @@ def simulate(model: Model, command: Array, load: Array | None = None, seed: int 
 def compute_answers(model: Model, com: Array, readings: Array, memory: Array | None = None) -> Array:
     """The drive, (n,), that the model's controller answers to demands `com`, (n,).
 
-    `readings` are those of all outputs, (n, outputs), or of the controlled one alone, (n,): others are NaN then.
-    `memory` is what its law remembers at the start; default: as at rest.
+    `readings` are those of all outputs, (n, outputs). `memory` is what its law remembers at the start; default: as at
+    rest.
     """
     memory = rest_controller(model) if memory is None else memory
     out = np.empty(len(com))
-    if readings.ndim == 1:
-        others = np.full((len(com), len(model.kind.signals.outputs) - 1), np.nan)
-        readings = np.column_stack([readings, others])
     run = build_kernel(run_controller, model.effects, plant=model.plant)
     control = np.concatenate([np.zeros(CONTROL_AT), memory])
     run(model.build_flat_state(), control, com, np.ascontiguousarray(readings), model.build_record(), out)

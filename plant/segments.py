@@ -283,7 +283,5 @@ def resample_on_cycles(t: Array, values: Array, period: float) -> Array:
     cycles = max(1, ceil((t[-1] - t[0] + tail) / period - SLACK))
     grid = t[0] + np.arange(cycles) * period
     row = np.searchsorted(t, grid + SLACK * min(period, 1 / RATE), side="right") - 1
-    lines = np.interp(grid, t, values)
-    demand: Array = np.where(np.append(is_sample, True)[row] | (np.abs(grid - t[row]) < SLACK * period), values[row],
-                             lines)
-    return demand
+    is_held = np.append(is_sample, True)[row] | (np.abs(grid - t[row]) < SLACK * period)
+    return np.asarray(np.where(is_held, values[row], np.interp(grid, t, values)))

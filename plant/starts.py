@@ -170,8 +170,7 @@ def _find_sizes(effect: Effect, name: str, off: float, command: Array, load: Arr
 
     def find_highest_level(values: Array) -> Array:
         change = compute_changes(effect, [{name: float(x)} for x in values], command, load, plant, beside=beside)
-        highest: Array = compute_levels(change, plant).max(axis=1)
-        return highest
+        return np.asarray(compute_levels(change, plant).max(axis=1))
 
     if hints := parse_hint(quantity):
         return hints if find_highest_level(np.array(hints)).max() > 0.0 else []

@@ -129,8 +129,7 @@ class Objective:
 
     def __call__(self, points: Floats) -> Floats:
         """Misfits, (m,), of points (m, 3)."""
-        cost: Floats = compute_misfit(self._compute_white_residuals(points))
-        return cost
+        return np.asarray(compute_misfit(self._compute_white_residuals(points)))
 
     def report(self, method: str, point: Sequence[float]) -> Row:
         """The answer at a point; evaluating it once more does not count as a simulation."""

@@ -141,8 +141,7 @@ def fit_values(model: Model, trace: Trace, free: Mapping[str, Bounds], signal: s
     def compute_jacobian(x: Floats) -> Floats:
         size = np.where(x + DIFFERENCE > high, -DIFFERENCE, DIFFERENCE)
         rows = compute_rows(np.vstack([x, x + np.diag(size)]))
-        slopes: Floats = ((rows[1:] - rows[0]) / size[:, None]).T
-        return slopes
+        return np.asarray(((rows[1:] - rows[0]) / size[:, None]).T)
 
     start = np.clip(np.array([model[name] for name in free]) / scale, low + 1e-6, high - 1e-6)
     fit = least_squares(lambda x: compute_rows(x[None])[0], start, compute_jacobian, (low, high), max_nfev=20,

@@ -69,11 +69,9 @@ def describe_motion(trace: Trace, model: Columns) -> Motion:
     v = differentiate(x, size, 1) / trace.period
     a = differentiate(x, 2 * size + 1, 2) / trace.period**2
     sign = hold_last(np.where(np.abs(v) > reverses, np.sign(v), np.nan))
-    turns = np.flatnonzero((np.diff(sign) != 0.0) & (sign[:-1] != 0.0)) + 1
-    last = np.full(len(x), -(10**9))
-    last[turns] = turns
-    rows = np.arange(len(x)) - np.maximum.accumulate(last)
-    since = np.where(rows > 10**8, math.inf, rows * trace.period)
+    is_turn = np.append(False, (np.diff(sign) != 0.0) & (sign[:-1] != 0.0))
+    rows = np.arange(len(x))
+    since = trace.period * np.asarray(rows - np.maximum.accumulate(np.where(is_turn, rows, -np.inf)), float)
     return Motion(x, v, a, {s.name: model[s.name] for s in others}, trace.drive, since, trace.declared, trace.scale)
 
 
@@ -259,8 +257,7 @@ def _examine_signal(trace: Trace, residual: Floats, difference: Floats | None,
 def autocorrelate(x: Floats) -> Floats:
     """At lags 0..REACH, of a residual that would be zero: its mean is not taken off."""
     whole = correlate(x, x, 0, REACH)
-    out: Floats = whole / whole[0] if whole[0] > 0.0 else np.eye(1, len(whole))[0]
-    return out
+    return np.asarray(whole / whole[0] if whole[0] > 0.0 else np.eye(1, len(whole))[0])
 
 
 def correlate(x: Floats, y: Floats, first: int, last: int) -> Floats:
@@ -279,8 +276,7 @@ def correlate(x: Floats, y: Floats, first: int, last: int) -> Floats:
 def _correlate_piece(x: Floats, y: Floats) -> Floats:
     """Sums of x_{k + lag} y_k for the lags at which y does not reach beyond the end of x, from 0 on."""
     n = 1 << (len(x) - 1).bit_length()
-    sums: Floats = np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n)
-    return sums
+    return np.asarray(np.fft.irfft(np.fft.rfft(x, n) * np.conj(np.fft.rfft(y, n)), n))
 
 
 def cumulate_periodogram(x: Floats, period: float) -> tuple[Floats, Floats, float, float]:

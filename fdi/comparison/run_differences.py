@@ -148,10 +148,8 @@ def sample_column(trace: Trace, name: str, t: Floats) -> Floats:
     nearest: Floats = np.rint(rows)
     values = trace.column(name)
     if not len(t) or float(np.abs(rows - nearest).max()) < 0.01:
-        samples: Floats = values[np.clip(nearest.astype(int), 0, len(values) - 1)]
-        return samples
-    between: Floats = np.interp(rows, np.arange(len(values)), values)
-    return between
+        return np.asarray(values[np.clip(nearest.astype(int), 0, len(values) - 1)])
+    return np.asarray(np.interp(rows, np.arange(len(values)), values))
 
 
 def _subtract(reference: Run, other: Run) -> RunPair:

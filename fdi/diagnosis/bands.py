@@ -30,7 +30,6 @@ from fdi.diagnosis.precursors import (
     find_lasting_peak,
     find_stays,
     measure_ramp,
-    read_columns,
     select_ramp_rows,
 )
 from fdi.estimation import is_friction
@@ -43,7 +42,7 @@ from fdi.thresholds import (
     SAME_COMMAND_TIME,
     SECTION_MEASURED_SHARE,
 )
-from fdi.trace import Flags, Floats, Section, Trace, describe_section, find_sections
+from fdi.trace import Flags, Floats, Section, Trace, describe_section, find_sections, hold_last
 from plant import (
     InputError,
     Model,
@@ -304,8 +303,8 @@ def judge_trace(source: Trace, bands: Bands, where: object = "trace") -> BandVer
     Raises:
         InputError: no position, or bands of another command or load.
     """
-    com, xj, load, period, t0 = read_columns(source)
-    return judge_position(com, xj, period, bands, load, t0, where)
+    xj = source.mask_unusable(source.declared.controlled.name)
+    return judge_position(hold_last(source.command), xj, source.period, bands, source.load, float(source.t[0]), where)
 
 
 def judge_position(com: Floats, xj: Floats, period: float, bands: Bands, load: Floats | None = None, t0: float = 0.0,

@@ -35,7 +35,6 @@ from fdi.diagnosis.precursors import (
     is_slow_ramp,
     measure_ramp,
     measure_step,
-    read_columns,
 )
 from fdi.estimation import limit_dynamic_friction, list_tolerance_sizes
 from fdi.progress import Progress, ignore_progress
@@ -52,7 +51,7 @@ from fdi.thresholds import (
     RAMP_HEALTHY_SHARE,
     STEP_FAULT_LEAVES_SD,
 )
-from fdi.trace import Floats, Section, Trace, fill_gaps, find_sections, measure_scale
+from fdi.trace import Floats, Section, Trace, fill_gaps, find_sections, hold_last, measure_scale
 from plant import WIDEST, Lanes, Model, count_nouns, count_threads, load_model, require
 
 FRICTION_AMOUNTS = (2, 5, 10, 14)  # sevenths of MaxBand, beside both limits
@@ -305,7 +304,7 @@ def learn_bands(traces: Sequence[Trace], model: Model | None = None, names: Sequ
     names = names or [f"trace {i + 1}" for i in range(len(traces))]
     require(len(traces) >= FLEET_FEWEST_TRACES, "--learn-bands", count_nouns(len(traces), "trace"),
             f"at least {FLEET_FEWEST_TRACES} healthy traces of one command")
-    com, _, _, period, _ = read_columns(traces[0])
+    com, period = hold_last(traces[0].command), traces[0].period
     base = choose_bands(com, np.zeros_like(com), period, model, progress, faults)
     rows = [_align_trace(base, trace, name) for trace, name in zip(traces, names, strict=True)]
     fleet = _Fleet(np.array([x for _, x in rows]), np.mean([c for c, _ in rows], axis=0), base)
@@ -323,8 +322,8 @@ def learn_bands(traces: Sequence[Trace], model: Model | None = None, names: Sequ
 
 def _align_trace(base: Bands, trace: Trace, name: str) -> tuple[Floats, Floats]:
     """Command and position of a trace on the rows of the base's command, gaps interpolated."""
-    com, xj, load, period, _ = read_columns(trace)
-    require(not is_loaded(load, base.kind), name, "load", "none: bands are learned from an unloaded plant")
+    com, xj, period = hold_last(trace.command), trace.mask_unusable(trace.declared.controlled.name), trace.period
+    require(not is_loaded(trace.load, base.kind), name, "load", "none: bands are learned from an unloaded plant")
     missing = float(np.isnan(xj).mean())
     require(missing <= POSITION_MISSING_SHARE, name, base.kind.signals.controlled.name,
             f"a whole position, not one with {100 * missing:.0f} % missing")
@@ -350,8 +349,7 @@ class _Fleet:
     def join_scatter(self, values: Floats, simulated_spread: Floats) -> Floats:
         """Standard deviation over the fleet, of (m, ..), shrunk to the simulated one and widened."""
         squares = FLEET_PRIOR_TRACES * simulated_spread**2 + self.freedom * values.var(axis=0, ddof=1)
-        out: Floats = self.wider * np.sqrt(squares / (FLEET_PRIOR_TRACES + self.freedom))
-        return out
+        return np.asarray(self.wider * np.sqrt(squares / (FLEET_PRIOR_TRACES + self.freedom)))
 
     def correct_step(self, s: StepBand) -> StepBand:
         """The fleet's mean and scatter; frictions and faults add to them what they add to a simulated unit's."""

@@ -37,15 +37,13 @@ def find_stays(beyond: Flags, lasting: int = BAND_EVENT_SAMPLES) -> list[tuple[i
 def find_lasting_peak(x: Floats, lasting: int = BAND_EVENT_SAMPLES) -> Floats:
     """The highest level that x (.., n), time last, keeps for `lasting` rows in a row; NaN is below all levels."""
     windows = np.lib.stride_tricks.sliding_window_view(np.where(np.isnan(x), -np.inf, x), lasting, axis=-1)
-    out: Floats = windows.min(axis=-1).max(axis=-1)
-    return out
+    return np.asarray(windows.min(axis=-1).max(axis=-1))
 
 
 def compute_half_range(error: Floats) -> Floats:
     """Half the range of a following error (.., n) m, time last, from its 1st to its 99th percentile."""
     low, high = np.nanpercentile(error, (1, 99), axis=-1)
-    half: Floats = (high - low) / 2
-    return half
+    return np.asarray((high - low) / 2)
 
 
 def select_ramp_rows(s: Section, period: float, settling: float = 0.2) -> slice:
@@ -57,12 +55,6 @@ def measure_ramp(x: Floats, com: Floats, s: Section, period: float) -> tuple[Flo
     """Following error, and speed beyond the demand's, of runs `x` (.., n) on a ramp of `com` (n,), in its direction."""
     rows, way = select_ramp_rows(s, period), np.sign(s.rate)
     return way * (com[rows] - x[..., rows]), way * compute_speed(x, 1.0 / period)[..., rows] - abs(s.rate)
-
-
-def read_columns(source: Trace) -> tuple[Floats, Floats, Floats, float, float]:
-    """Command without holes, position with NaN where it cannot be used, load, period and first time of a trace."""
-    position = source.mask_unusable(source.declared.controlled.name)
-    return hold_last(source.command), position, source.load, source.period, float(source.t[0])
 
 
 class Meaning(NamedTuple):
@@ -121,7 +113,7 @@ def measure_precursors(source: Trace, band_precursors: Mapping[str, Mapping[str,
         source: the trace.
         band_precursors: `Bands.precursors`: of healthy units and by fault.
     """
-    com, xj, _, period, _ = read_columns(source)
+    com, xj, period = hold_last(source.command), source.mask_unusable(source.declared.controlled.name), source.period
     if np.isnan(xj).mean() > POSITION_MISSING_SHARE:
         return {}
     unit, scale = source.declared.controlled.unit, source.scale

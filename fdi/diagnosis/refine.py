@@ -21,6 +21,7 @@ from itertools import combinations, product, zip_longest
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtr
 
 from fdi.comparison.jack import P12
 from fdi.diagnosis.faults import CLOGGING, FAULTS, Estimate, Fault, Level, compute_severity, judge_size
@@ -97,7 +98,7 @@ from fdi.thresholds import (
     UNIT_TOLERANCE,
     WEIGHT_COUNTS,
 )
-from fdi.trace import Floats, Trace
+from fdi.trace import Floats, Trace, rms
 from plant import Model, ensure_starts, find_quantity, is_offered, list_searched_effects, map_in_threads, require
 from plant.effects import CATALOGUE
 from plant.threads import R, T
@@ -510,8 +511,8 @@ def _retry_without(problem: CountedProblem, fit: Fit, most: int = 2) -> Fit:
     its place; without a suspect, such as a null bias, at a unit with the same faults and no other deviation, and a
     fault that looks like the suspect in its place.
     """
-    fine = replace(problem, workers=1, steps=FINE_STEPS, _lanes={})
     alone = problem.alone
+    fine = replace(alone, steps=FINE_STEPS, _lanes={})
 
     def fit_from(starts: Floats) -> Fit:
         best = starts[int(np.argmin(problem.compute_costs(fit.free, starts)))]
@@ -626,7 +627,7 @@ def is_noise_left(problem: Problem, fit: Fit) -> bool:
 
 def measure_ratios(problem: Problem, fit: Fit) -> list[float]:
     """RMS residual over noise, signal by signal."""
-    return [float(np.sqrt(np.nanmean(r**2))) / n.level for r, n in zip(fit.residuals, problem.noise, strict=True)]
+    return [rms(r) / n.level for r, n in zip(fit.residuals, problem.noise, strict=True)]
 
 
 def choose_start(problem: CountedProblem, free: Sequence[Free], starts: Sequence[Sizes]) -> Floats:
@@ -713,7 +714,7 @@ def find_hopeless_ratio(trace: Trace, name: str) -> float:
 def learn_left_noise(problem: CountedProblem, fit: Fit) -> CountedProblem:
     """The problem with the noise that a fit leaves, signal by signal, where only noise is left."""
     return replace(problem, noise=tuple(
-        noises.fit_noise(r) if float(np.sqrt(np.nanmean(r**2))) <= RESIDUAL_IS_NOISE * old.level else old
+        noises.fit_noise(r) if rms(r) <= RESIDUAL_IS_NOISE * old.level else old
         for old, r in zip(problem.noise, fit.residuals, strict=True)), _lanes={})
 
 
@@ -990,9 +991,9 @@ class JointSearch:
         start = start_fit([h.fit.free[k] for k in places], h.fit.x[places])
         return Hypothesis(tuple(e for e in h.effects if e != effect), self.descend(start, ((3.0, 4), (1.0, 8))), {})
 
-    def is_near(self, h: Hypothesis, far: float = 7.0) -> bool:
+    def is_near(self, h: Hypothesis) -> bool:
         """Whether a fit leaves so little that beginning again elsewhere may help."""
-        return max(measure_ratios(self.problem, h.fit)) < far
+        return max(measure_ratios(self.problem, h.fit)) < RESIDUAL_HOPELESS
 
     def restart(self, h: Hypothesis, parts: Sequence[float]) -> Hypothesis:
         """The best of a fit and those from points on the line to a unit with its faults and effects, otherwise healthy.
@@ -1084,7 +1085,7 @@ def average_explanations(candidates: Sequence[Explanation], marks: Mapping[str, 
     pairs = sorted((pair for pair in zip(weights, rivals, strict=True) if pair[0] >= WEIGHT_COUNTS),
                    key=lambda pair: -pair[0])
     total = sum(weight for weight, _ in pairs)
-    explanations = tuple(Explanation(e.effects, e.parameters, e.refinement, weight / total) for weight, e in pairs)
+    explanations = tuple(replace(e, weight=weight / total) for weight, e in pairs)
     faults = explanations[0].refinement.faults
     weights = [e.weight for e in explanations]
     sizes = {f.name: mix_estimates([e.refinement.sizes[f.name] for e in explanations], weights) for f in faults}
@@ -1115,8 +1116,6 @@ def mix_estimates(estimates: Sequence[Estimate], weights: Sequence[float]) -> Es
     """
     if len(estimates) == 1:
         return estimates[0]
-    from scipy.special import ndtr  # here: half a second to import, and most diagnoses need none of it
-
     centre = np.array([e.value for e in estimates])
     below, above = (np.array([max(abs(end - e.value), 1e-9 * abs(e.value) + 1e-300) / INTERVAL_95_SD
                               for end, e in zip(ends, estimates, strict=True)])

@@ -306,9 +306,9 @@ def list_commands(trace: Trace) -> list[Command]:
 
 def _same_command(search: Search, h: Hypothesis, signals: tuple[str, ...]) -> Trace:
     """The run as a hypothesis predicts it, with more sensors."""
-    names = [f.name for f in h.fit.free]
-    columns = search.problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
-    trace = search.problem.trace
+    problem, free = search.problem, h.fit.free
+    columns = problem.predict_signals([f.name for f in free], problem.convert_unknowns(free, h.fit.x[None]))[0]
+    trace = problem.trace
     return trace.with_columns(dict(zip(trace.output_names, columns, strict=True)), usable=np.ones(len(trace), bool),
                               outputs=tuple(s for s in trace.output_names if s in signals))
 
@@ -318,9 +318,8 @@ def _simulate_command(search: Search, h: Hypothesis, play: Callable[[Floats], tu
     """Another command as a hypothesis predicts it, with the model's own controller."""
     problem = search.problem
     com, load = play(np.arange(0.0, SECONDS, problem.model["controller.period"]))
-    names = [f.name for f in h.fit.free]
-    return simulate_trace(Lanes(problem.model, names, problem.steps, 1), np.array([h.fit.values[n] for n in names]),
-                          com, load, signals)
+    lanes = Lanes(problem.model, [f.name for f in h.fit.free], problem.steps, 1)
+    return simulate_trace(lanes, problem.convert_unknowns(h.fit.free, h.fit.x[None])[0], com, load, signals)
 
 
 def _measure_misfit(search: Search, truth: Hypothesis, wrong: Hypothesis, trace: Trace) -> float:

@@ -77,7 +77,7 @@ from fdi.thresholds import (
     SIGNAL_SPOILED,
     SOLVER_ERROR_SHARE,
 )
-from fdi.trace import Floats, Trace, find_comb, hold_last, is_rounding_left, measure_resolution
+from fdi.trace import Floats, Trace, find_comb, hold_last, is_rounding_left, measure_resolution, rms
 from plant import Model, list_searched_effects
 
 NOISE_LEFT = ("NOTHING_MISSING", "NOT_RESOLVABLE", "EXPLAINED", "AMBIGUOUS")
@@ -545,8 +545,8 @@ def _judge_run(problem: Problem, residuals: Floats, h: Hypothesis, floor: Mappin
     share, rest = float(is_undecided.mean()), residuals[:, ~is_undecided]
     if share > HELD_OUT_UNDECIDED_SHARE:
         return HeldOut(False)
-    rms = np.sqrt(np.nanmean(rest**2, axis=1)).tolist()
-    return HeldOut(_is_noise(rest, problem.trace, floor), share, dict(zip(problem.trace.outputs, rms, strict=True)))
+    errors = dict(zip(problem.trace.outputs, map(rms, rest), strict=True))
+    return HeldOut(_is_noise(rest, problem.trace, floor), share, errors)
 
 
 def _is_noise(residuals: Floats, trace: Trace, floor: Mapping[str, float]) -> bool:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from fdi.discovery.search import Hypothesis, Search
 from fdi.estimation import Problem
@@ -249,9 +250,9 @@ def compute_balances(problem: Problem, h: Hypothesis, floor: Mapping[str, float]
     each signal, SI.
     """
     trace = problem.trace
-    names = [f.name for f in h.fit.free]
+    free, x = h.fit.free, h.fit.x
     values = {**problem.model.values, **h.fit.values}
-    replay = problem.predict_signals(names, np.array([[h.fit.values[n] for n in names]]))[0]
+    replay = problem.predict_signals([f.name for f in free], problem.convert_unknowns(free, x[None]))[0]
     measurement = replay.copy()
     columns = trace.output_columns
     measurement[columns] = np.where(np.isnan(trace.measurements), replay[columns], trace.measurements)
@@ -280,8 +281,6 @@ def compute_balances(problem: Problem, h: Hypothesis, floor: Mapping[str, float]
 
 def find_followed_rows(x: Floats, noise: float, share: float = 0.03) -> Flags:
     """Rows of a signal (n,) that the smoothing polynomials follow: to its noise, or to a share of its local swing."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d  # here, as it takes a second to import
-
     window = ACCELERATION_WINDOW
     swing = maximum_filter1d(x, 3 * window) - minimum_filter1d(x, 3 * window)
     off = np.abs(x - _smooth(x, window)) > 6.0 * noise + share * swing

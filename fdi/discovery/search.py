@@ -74,7 +74,7 @@ from fdi.thresholds import (
     SOLVER_ERROR_SHARE,
     WHITE_SQUARE_POOR,
 )
-from fdi.trace import Flags, Floats, Trace
+from fdi.trace import Flags, Floats, Trace, rms
 from plant import Model, Part, count_threads, map_together
 from plant.threads import R, T
 
@@ -339,7 +339,7 @@ class Search:
         width = np.where(has_prior, 0.5, 0.1 * np.maximum(np.abs(start.x), 0.1))
         end = follow_population(
             coarse, start, np.diag(width**2), VALLEY_STAGES, 0,
-            lambda problem, fit, rounds, factor: fit_unknowns(scale_noise(problem, factor), free, fit.x, rounds))
+            lambda fit, factor: fit_unknowns(scale_noise(coarse, factor), free, fit.x, 2))
         other = self.judge_fit(h.effects, fit_unknowns(self.problem, free, end.x))
         return min(h, other, key=lambda each: each.cost + each.repeat_cost)
 
@@ -393,7 +393,7 @@ class Search:
         """What a fit leaves, on its own run and on the repeats: `others`, (s, n) SI each, where that is known."""
         signals = self.problem.trace.outputs
         residuals = fit.residuals[:, :len(self.problem.trace)]  # the first run of a fit to several
-        errors = _measure_rms(residuals, signals)
+        errors = dict(zip(signals, map(rms, residuals), strict=True))
         coarse = [self.coarse.get(s, 0.0) for s in signals]
         others = others or [p.compute_residuals(fit.free, fit.x[None])[0] for p in self.repeats]
         floor = {s: float(np.hypot(n.level, c)) for s, n, c in zip(signals, self.noise, coarse, strict=True)}
@@ -429,7 +429,8 @@ class Search:
         """RMS residuals on the run that no fit saw, SI units; {} without one."""
         if self.holdout is None:
             return [{} for _ in hypotheses]
-        return [_measure_rms(residuals, self.holdout.outputs) for residuals in self.replay_holdout(hypotheses)[1]]
+        return [dict(zip(self.holdout.outputs, map(rms, residuals), strict=True))
+                for residuals in self.replay_holdout(hypotheses)[1]]
 
     def measure_unseen_costs(self, hypotheses: Sequence[Hypothesis]) -> list[float]:
         """Robust sums of squares of what is left of the run that no fit saw; [] without one."""
@@ -744,10 +745,6 @@ def _leave_out_worst(residuals: Floats, share: float = 0.15) -> Floats:
     return np.where(np.repeat(is_typical, BLOCK, axis=1)[:, :residuals.shape[1]], residuals, np.nan)
 
 
-def _measure_rms(residuals: Floats, signals: Sequence[str]) -> dict[str, float]:
-    return {s: float(np.sqrt(np.nanmean(r**2))) for s, r in zip(signals, residuals, strict=True)}
-
-
 def _place_base(base: Hypothesis, h: Hypothesis) -> Floats:
     """The base's unknowns, (p,), where a fit with an effect has left them; at 0 those at a bound."""
     values = h.fit.values
@@ -1055,7 +1052,7 @@ def compute_sensitivity(problem: Problem, fit: Fit, effects: Iterable[str]) -> S
                             for part in parts])
     thin = (white[1:] - white[0]).reshape(len(starts), -1) * np.sqrt(NULL_STRIDE)
     slopes = fit.jacobian[:, :, ::NULL_STRIDE].reshape(len(fit.x), thin.shape[1]) * np.sqrt(NULL_STRIDE)
-    prior = np.diag([f.prior**-2 + 1e-9 for f in fit.free])
+    prior = np.diag(weigh_priors(fit.free) + 1e-9)
     directions = thin - (thin @ slopes.T) @ np.linalg.solve(slopes @ slopes.T + prior, slopes)
     length = np.sqrt(np.maximum(np.einsum("ij,ij->i", directions, directions), 1e-300))
     return Sensitivity(tuple(e for e, _ in starts), (directions @ directions.T) / np.outer(length, length), length**2)

@@ -183,8 +183,7 @@ def draw_noise(noise: Noise, n: int, rng: np.random.Generator) -> Floats:
     from scipy.signal import lfilter  # here: it takes long to import
 
     settling = 1000  # samples until the process has forgotten its start
-    samples: Floats = lfilter([noise.innovation], noise.filter, rng.standard_normal(settling + n))[settling:]
-    return samples
+    return np.asarray(lfilter([noise.innovation], noise.filter, rng.standard_normal(settling + n))[settling:])
 
 
 def judge_injection(injection: Injection, unit: Unit) -> dict[str, Any]:

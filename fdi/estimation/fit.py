@@ -121,7 +121,6 @@ class Problem:
     trace: Trace
     noise: tuple[Noise, ...]  # of each signal
     steps: int = 10  # a cycle, at least `find_fewest_steps`; last fits use more
-    anchor: float = ANCHOR_RATE
     workers: int = 1
     bare: Model | None = None  # the same without the effects at off values: five times as fast where it will do
     also: tuple[Trace, ...] = ()  # further runs, of the same signals, that a fit takes in
@@ -144,7 +143,7 @@ class Problem:
             self._lanes[key] = Lanes(self.bare if is_bare and self.bare else self.model, key,
                                      max(self.steps, find_fewest_steps(self.model.kind)), self.workers)
         trace = self.trace if trace is None else trace
-        out = self._lanes[key].replay(values, trace.drive, trace.load, trace.anchor, self.anchor, trace.parts,
+        out = self._lanes[key].replay(values, trace.drive, trace.load, trace.anchor, ANCHOR_RATE, trace.parts,
                                       trace.chambers, trace.slack)
         flat = out.transpose(0, 2, 1).reshape(-1)
         if not float(flat @ flat) < FURTHEST**2:  # a trial at which the simulation diverges
@@ -247,8 +246,7 @@ def cut_blocks(white: Floats, block: int = BLOCK) -> Floats:
 def sum_blocks(white: Floats, block: int = BLOCK) -> Floats:
     """Sums of squares of whitened residuals (.., n) over blocks of so many: (.., b)."""
     blocks = cut_blocks(white, block)
-    sums: Floats = np.einsum("...i,...i->...", blocks, blocks)
-    return sums
+    return np.asarray(np.einsum("...i,...i->...", blocks, blocks))
 
 
 def compute_misfit(white: Floats) -> Floats:
@@ -256,8 +254,7 @@ def compute_misfit(white: Floats) -> Floats:
     sums = sum_blocks(white)
     limit = BLOCK_FITTED_SQUARE * BLOCK
     beyond = limit * (1.0 + np.log(np.maximum(sums, limit) / limit))
-    total: Floats = np.where(sums <= limit, sums, beyond).sum(axis=(1, 2))
-    return total
+    return np.asarray(np.where(sums <= limit, sums, beyond).sum(axis=(1, 2)))
 
 
 def weigh_blocks(white: Floats, block: int = BLOCK) -> Floats:
@@ -266,8 +263,7 @@ def weigh_blocks(white: Floats, block: int = BLOCK) -> Floats:
     Of residuals at fewer samples, `block` is the number of them in a block.
     """
     sums = sum_blocks(white, block)
-    weights: Floats = np.minimum(1.0, BLOCK_FITTED_SQUARE * block / np.maximum(sums, 1e-300))
-    return weights
+    return np.asarray(np.minimum(1.0, BLOCK_FITTED_SQUARE * block / np.maximum(sums, 1e-300)))
 
 
 def compute_weights(white: Floats) -> Floats:
@@ -282,8 +278,7 @@ def compute_typical_rms(residuals: Floats, share: float = 0.85) -> Floats:
     """
     squares = [np.sort(sum_blocks(row[~np.isnan(row)])) for row in residuals]
     means = [each[:max(1, round(share * len(each)))].mean() if len(each) else 0.0 for each in squares]
-    rms: Floats = np.sqrt(np.array(means) / BLOCK)
-    return rms
+    return np.asarray(np.sqrt(np.array(means) / BLOCK))
 
 
 UNREPLAYED = ("command", "reading")  # ports that a replay from the measured current does not pass
@@ -418,7 +413,7 @@ class Fit:
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameters in SI units."""
+        """Parameters in SI units; a ratio of two frictions stays one, which `Problem.list_values` makes a friction."""
         return {f.name: f.value(float(v)) for f, v in zip(self.free, self.x, strict=True)}
 
     def spread(self, name: str) -> float:
@@ -636,8 +631,8 @@ def evolve_fit(problem: Problem, fit: Fit, spread: Floats, generations: int, see
     return replace(fit, x=best, cost=best_cost, covariance=step**2 * spread)
 
 
-def follow_population(problem: P, fit: Fit, spread: Floats, stages: Sequence[tuple[float, int]], seed: int,
-                      descend: Callable[[P, Fit, int, float], Fit]) -> Fit:
+def follow_population(problem: Problem, fit: Fit, spread: Floats, stages: Sequence[tuple[float, int]], seed: int,
+                      descend: Callable[[Fit, float], Fit]) -> Fit:
     """The fit at which a population ends whose noise counts for less from stage to stage.
 
     Args:
@@ -646,11 +641,11 @@ def follow_population(problem: P, fit: Fit, spread: Floats, stages: Sequence[tup
         spread: their covariance, (p, p).
         stages: factor on the noise and generations, each.
         seed: of the trials.
-        descend: takes a fit of a problem so many rounds further, with its noise so many times as large.
+        descend: takes a fit some rounds further, with the noise so many times as large.
     """
     for number, (factor, generations) in enumerate(stages):
         best = evolve_fit(scale_noise(problem, factor), fit, spread, generations, 10 * seed + number)
         spread = 4.0 * best.covariance
-        end = descend(problem, best, 2, factor)
+        end = descend(best, factor)
         fit = end if end.cost < best.cost else best
     return fit

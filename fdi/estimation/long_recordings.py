@@ -57,8 +57,8 @@ def _is_driven_by_pressures(trace: Trace, model: Model) -> bool:
     return trace.chambers is not None and model.kind.measured_pressures is not None
 
 
-def replay_in_turns(lanes: Lanes, values: Floats, trace: Trace, position: Floats | None, anchor: float,
-                    rows: int = TURN) -> Iterator[tuple[int, Floats]]:
+def replay_in_turns(lanes: Lanes, values: Floats, trace: Trace, rows: int = TURN, position: Floats | None = None
+                    ) -> Iterator[tuple[int, Floats]]:
     """The outputs as the sensors of the trace show them, so many `rows` at a time: the first row, (m, k, outputs).
 
     Memory does not grow with the recording, unless the position is predicted from measured pressures.
@@ -67,18 +67,19 @@ def replay_in_turns(lanes: Lanes, values: Floats, trace: Trace, position: Floats
         lanes: runs of a model.
         values: (m, len(lanes.names)) their parameters, SI.
         trace: a prepared recording.
-        position: (n,) m, to which the ram is pulled; None for a run from the middle.
-        anchor: 1/s, how fast.
         rows: of a turn.
+        position: (n,), to which the replay is drawn; default: as measured.
     """
+    position = trace.anchor if position is None else position
     if _is_driven_by_pressures(trace, lanes.model):
-        out = lanes.replay(values, trace.drive, trace.load, position, anchor, trace.parts, trace.chambers,
+        out = lanes.replay(values, trace.drive, trace.load, position, ANCHOR_RATE, trace.parts, trace.chambers,
                            trace.slack)
         whole = trace.pass_sensors(out)
         yield from ((first, whole[:, first:first + rows]) for first in range(0, len(trace), rows))
         return
     memory = np.empty((len(values), 0, len(trace.output_names)))  # what a filtering sensor remembers
-    for first, out in lanes.replay_in_turns(values, trace.drive, trace.load, position, anchor, rows, trace.slack):
+    turns = lanes.replay_in_turns(values, trace.drive, trace.load, position, ANCHOR_RATE, rows, trace.slack)
+    for first, out in turns:
         if not trace.sensors:
             yield first, out
             continue
@@ -152,7 +153,7 @@ def _measure_information(trace: Trace, model: Model, floor: Mapping[str, float],
     scale = 1.0 / np.array([floor[name] for name in trace.outputs])
     information, misfit = np.zeros((count, len(variants), len(variants))), np.zeros(count)
     shares = np.zeros(count)
-    turns = replay_in_turns(lanes, limit_dynamic_friction(names, table), trace, trace.anchor, ANCHOR_RATE, rows)
+    turns = replay_in_turns(lanes, limit_dynamic_friction(names, table), trace, rows)
     for k, (first, out) in enumerate(turns):
         if k >= count:
             break
@@ -271,7 +272,7 @@ def judge_on_all(problem: Problem, fits: Sequence[Fit], trace: Trace, steps: int
     values = np.array([[parameters.get(name, problem.model[name]) for name in names] for parameters in fit_values])
     lanes = Lanes(problem.model, names, steps)
     squares, counts = [], []
-    turns = replay_in_turns(lanes, limit_dynamic_friction(names, values), trace, trace.anchor, problem.anchor)
+    turns = replay_in_turns(lanes, limit_dynamic_friction(names, values), trace)
     for first, out in turns:
         measurements = trace.measurements[:, first:first + out.shape[1]]
         residuals = np.ascontiguousarray(out.transpose(0, 2, 1)[:, trace.output_columns] - measurements)

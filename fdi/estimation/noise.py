@@ -279,8 +279,7 @@ def _fit_phasors(x: Floats, rows: Flags, frequencies: Floats, period: float) -> 
     level = level - np.outer(np.einsum("ij,j->i", level, t) / np.sum(t**2), t)
     turn = -2j * np.pi * period * frequencies
     inside = np.einsum("ij,jk->ik", level, np.exp(np.outer(np.arange(WINDOW), turn)))
-    out: NDArray[np.complex128] = 2.0 / WINDOW * (inside * np.exp(np.outer(windows * WINDOW, turn))).mean(axis=0)
-    return out
+    return np.asarray(2.0 / WINDOW * (inside * np.exp(np.outer(windows * WINDOW, turn))).mean(axis=0))
 
 
 def _remove_lines(x: Floats, lines: Sequence[tuple[float, float]], period: float) -> Floats:
@@ -290,8 +289,7 @@ def _remove_lines(x: Floats, lines: Sequence[tuple[float, float]], period: float
     frequencies = np.array([f for f, _ in lines])
     rows = np.ones(len(x) // WINDOW, bool)
     wave = np.exp(2j * np.pi * period * np.outer(np.arange(len(x)), frequencies))
-    out: Floats = x - np.einsum("ij,j->i", wave, _fit_phasors(x, rows, frequencies, period)).real
-    return out
+    return np.asarray(x - np.einsum("ij,j->i", wave, _fit_phasors(x, rows, frequencies, period)).real)
 
 
 class Noise(NamedTuple):

@@ -123,11 +123,10 @@ def _replay_with_other_frictions(trace: Trace, model: Model, floor: Mapping[str,
         names = list(list_tolerance_sizes(model))
     values = vary_frictions(names, model.values)
     lanes = Lanes(silence_sensors(model), names, REPLAY_STEPS)
-    turns = [replay_in_turns(lanes, values, trace, trace.anchor, ANCHOR_RATE)]
+    turns = [replay_in_turns(lanes, values, trace)]
     currents = guess_current(trace)
-    turns += [replay_in_turns(lanes, values[:1], trace.with_inputs(drive=current), trace.anchor, ANCHOR_RATE)
-              for current in currents]
-    turns += [replay_in_turns(lanes, values[:1], trace, trace.anchor + shift, ANCHOR_RATE)
+    turns += [replay_in_turns(lanes, values[:1], trace.with_inputs(drive=current)) for current in currents]
+    turns += [replay_in_turns(lanes, values[:1], trace, position=trace.anchor + shift)
               for noise in guess_anchor_noise(trace, model, floor) for shift in (noise, -noise)]
     outputs = trace.declared.outputs
     columns = np.empty((len(outputs), len(trace)))
@@ -248,7 +247,7 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
         fit: the values to replay.
         floor: of each signal, SI; smaller changes do not count.
     """
-    values = {**problem.model.values, **fit.values}
+    values = {**problem.model.values, **problem.list_values(fit.free, fit.x)}
     names = list(dict.fromkeys([*(f.name for f in fit.free), *filter(is_friction, values)]))
     variants = vary_frictions(names, values)
     runs = problem.predict_outputs(names, variants)
@@ -265,8 +264,7 @@ def find_undecided_rows(problem: Problem, fit: Fit, floor: Mapping[str, float]) 
     power = measure_window_power(all_changes.reshape(-1, all_changes.shape[2])).reshape(all_changes.shape)
     least = np.array([[max(floor[s], problem.trace.declared.find(s).slight)] for s in problem.trace.outputs])
     is_large = power.max(axis=0, initial=0.0) > least**2
-    undecided: Flags = (is_large & ~np.isnan(problem.trace.measurements)).any(axis=0)
-    return undecided
+    return np.asarray((is_large & ~np.isnan(problem.trace.measurements)).any(axis=0))
 
 
 def find_rest_rows(position: Floats, period: float, noise: float, window: float = 0.05,
@@ -330,7 +328,8 @@ def find_unpredictable_rows(problem: Problem, fit: Fit, floor: Mapping[str, floa
     alone, reach = replace(problem, also=()), None
     undecided = find_undecided_rows(alone, fit, floor) | ~problem.trace.usable
     if problem.model.kind.correct is not None and any(map(is_friction, problem.model.values)):
-        values = {name: x for name, x in problem.model.values.items() if is_friction(name)} | fit.values
+        frictions = {name: x for name, x in problem.model.values.items() if is_friction(name)}
+        values = frictions | problem.list_values(fit.free, fit.x)
         rows = np.array([[x * keep if is_friction(n) else x for n, x in values.items()] for keep in (1.0, 0.0)])
         reach = np.diff(alone.predict_outputs(list(values), rows), axis=0)[0] / levels
     undecided = extend_until_noise(undecided, residuals / levels, reach)
@@ -619,7 +618,8 @@ def read_cycles(trace: Trace, model: Model, outputs: Sequence[str] | None = None
     if rows_in_cycle > 1 and abs(1 / ratio / rows_in_cycle - 1) < SAME_PERIOD:
         phase = _find_new_current(rows.drive, rows_in_cycle)
         if phase is not None:
-            cycles = _thin_rows(rows, rows_in_cycle, phase)
+            few = slice(phase, None, rows_in_cycle)
+            cycles = rows.take_rows(few, incomplete=np.isnan(rows.controlled[few]), period=rows_in_cycle * rows.period)
             require(len(cycles) >= FEWEST_ROWS, source, "t", f"at least {FEWEST_ROWS} cycles, not {len(cycles)}")
             for name in (trace.declared.controlled.name, *outputs):
                 require(not np.isnan(cycles.column(name)).all(), source, name, "readings in the rows in which "
@@ -723,19 +723,12 @@ def _find_new_current(cor: Floats, rows: int) -> int | None:
     return int(counts.argmax()) if len(new) and counts.max() > 0.95 * len(new) else None
 
 
-def _thin_rows(trace: Trace, rows: int, phase: int) -> Trace:
-    """Every so many rows, from row `phase` on."""
-    selection = slice(phase, None, rows)
-    return trace.take_rows(selection, incomplete=np.isnan(trace.controlled[selection]), period=trace.period * rows)
-
-
 def _spread_rows(trace: Trace, cycles: int) -> Trace:
     """Each row as one of so many cycles, nothing recorded in the others."""
     n = (len(trace) - 1) * cycles + 1
     period = trace.period / cycles
-    columns = {name: np.full(n, np.nan) for name in trace.columns}
-    for name, column in columns.items():
-        column[::cycles] = trace.columns[name]
+    is_between = np.arange(n) % cycles > 0
+    columns = {name: np.where(is_between, np.nan, np.repeat(x, cycles)[:n]) for name, x in trace.columns.items()}
     return replace(trace, columns=columns, t=np.round(trace.t[0] + period * np.arange(n), 9), period=period,
                    phase=np.repeat(trace.phase, cycles)[:n], usable=np.repeat(trace.usable, cycles)[:n],
                    filled=np.zeros(n, bool),

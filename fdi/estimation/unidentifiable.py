@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, Self, TypeVar
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -276,7 +276,7 @@ def find_flat_directions(problem: Problem, free: Sequence[Free], x: Floats,
     `FLAT_DIRECTION_MISFIT`, or of `allowed` for one of the `others`. Parameters of effects are no logarithms:
     they move by their power of their value.
     """
-    at = {f.name: f.value(float(v)) for f, v in zip(free, x, strict=True)}
+    at = problem.list_values(free, x)
     powers = [{**flat, **{name: power * at[name] for name, power in effects.items() if name in at}}
               for flat, effects in zip(list_powers(problem), FLAT_WITH_EFFECTS, strict=True)]
     directions = [flat for flat in (*powers, *others) if next(iter(flat)) in {f.name for f in free}]
@@ -345,8 +345,7 @@ def _keep_still(flat: Floats, k: int) -> Floats:
     """The directions within the flat ones along which unknown k does not move."""
     row = flat[k:k + 1]
     _, _, rows = np.linalg.svd(row)
-    within: Floats = flat @ rows[1:].T
-    return within
+    return np.asarray(flat @ rows[1:].T)
 
 
 class LogFree(Free):
@@ -425,8 +424,6 @@ class LogProblem(Problem):
     def list_values(self, free: Sequence[Free], x: Floats) -> dict[str, float]:
         return dict(zip([f.name for f in free], compute_values(free, x).tolist(), strict=True))
 
-
-L = TypeVar("L", bound=LogProblem)
 
 PATIENCE = 3  # rounds without a gain, in which the covariance still grows to what it is
 DIRECTION_WIDTH_SD = 3.0  # of a difference, standard deviations
@@ -524,8 +521,7 @@ def _weigh_slopes(fit: Fit, jacobian: Floats) -> Fit:
 def _find_principal(covariance: Floats) -> Floats:
     """Principal directions (p, p), one a column, `DIRECTION_WIDTH_SD` standard deviations long."""
     variances, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    wide: Floats = DIRECTION_WIDTH_SD * vectors * np.sqrt(np.clip(variances, NARROWEST_VARIANCE, WIDEST_VARIANCE))
-    return wide
+    return np.asarray(DIRECTION_WIDTH_SD * vectors * np.sqrt(np.clip(variances, NARROWEST_VARIANCE, WIDEST_VARIANCE)))
 
 
 def descend_valley(problem: Problem, fit: Fit, rounds: int, flat: Floats, stage: Stage = NO_STAGE,
@@ -652,8 +648,8 @@ def follow_profile(problem: Problem, fit: Fit, k: int, end: float, more: float) 
     return fits
 
 
-def search_widely(problem: L, shown_by: LogProblem, home: Fit, widths: Floats, stages: Sequence[tuple[float, int]],
-                  seed: int) -> Fit:
+def search_widely(problem: LogProblem, shown_by: LogProblem, home: Fit, widths: Floats,
+                  stages: Sequence[tuple[float, int]], seed: int) -> Fit:
     """The fit at which a population ends that begins about `home`.
 
     Args:
@@ -664,10 +660,8 @@ def search_widely(problem: L, shown_by: LogProblem, home: Fit, widths: Floats, s
         stages: factor on the noise and generations, each.
         seed: of the trials.
     """
-    def slide(problem: L, fit: Fit, rounds: int, factor: float) -> Fit:
-        return descend(problem, fit, ((factor, rounds),), shown_by)
-
-    start = slide(problem, home, 3, stages[0][0])
+    start = descend(problem, home, ((stages[0][0], 3),), shown_by)
     spread = 9.0 * start.covariance + np.diag(widths**2)
     start = replace(start, x=np.where(widths > 0.0, home.x, start.x))
-    return follow_population(problem, start, spread, stages, seed, slide)
+    return follow_population(problem, start, spread, stages, seed,
+                             lambda fit, factor: descend(problem, fit, ((factor, 2),), shown_by))

@@ -84,10 +84,9 @@ def fit_from_afar(problem: LogProblem, free: Sequence[Free], seed: int, progress
     fits = [start_fit(free, x) for x in first_starts]
     for number, (factor, count, rounds, steps) in enumerate(FIT_STAGES):
         progress(f"fitting, {len(fits[:count])} at a time", 0.1 + 0.15 * number)
-        stage = replace(problem, workers=1, steps=steps)
 
-        def advance(fit: Fit, stage: LogProblem = stage, rounds: int = rounds, factor: float = factor) -> Fit:
-            alone = replace(stage, _lanes={})
+        def advance(fit: Fit, steps: int = steps, rounds: int = rounds, factor: float = factor) -> Fit:
+            alone = replace(problem.alone, steps=steps)
             return descend(alone, scan_unknowns(scale_noise(alone, factor), fit), ((factor, rounds),))
 
         fits = sorted(map_in_threads(advance, fits[:count], problem.workers), key=lambda fit: fit.cost)
@@ -122,12 +121,10 @@ def search_other_valleys(problem: LogProblem, fit: Fit, seed: int, progress: Pro
 
 
 def _search_narrowly(problem: LogProblem, best: Fit, seed: int) -> Fit:
-    def slide(problem: LogProblem, fit: Fit, rounds: int, factor: float) -> Fit:
-        return descend(problem, fit, ((factor, rounds),))
-
-    start = slide(problem, start_fit(best.free, best.x), 3, NARROW_STAGES[0][0])
+    start = descend(problem, start_fit(best.free, best.x), ((NARROW_STAGES[0][0], 3),))
     spread = 4.0 * start.covariance + np.diag(_widen_frictions(best.free, 0.15, 0.0) ** 2)
-    return follow_population(problem, start, spread, NARROW_STAGES, seed, slide)
+    return follow_population(problem, start, spread, NARROW_STAGES, seed,
+                             lambda fit, factor: descend(problem, fit, ((factor, 2),)))
 
 
 def _widen_frictions(free: Sequence[Free], static: float, dynamic: float) -> Floats:
@@ -152,12 +149,11 @@ def scan_unknowns(problem: LogProblem, fit: Fit, rounds: int = 2) -> Fit:
     """The fit at the best place of a grid along each free unknown, one after the other; tolerances are left alone."""
     free, x = fit.free, fit.x
     low, high = scaled_bounds(free)
-    prior = np.array([f.prior**-2 for f in free])
     steps = [(k, way / f.scale if isinstance(f, LogFree) else way) for k, f in enumerate(free) if is_wide(f)
              for way in GRID]
     for _ in range(rounds):
         trials = np.array([x, *(np.clip(put_unknown(x, k, x[k] + step), low, high) for k, step in steps)])
-        costs = compute_misfit(problem.compute_white_residuals(free, trials)) + trials**2 @ prior
+        costs = problem.compute_costs(free, trials)
         best = int(np.argmin(costs))
         if best == 0 or costs[best] > costs[0] - 1.0:
             break

@@ -60,6 +60,7 @@ from fdi.estimation import (
     simulate_trace,
     start_fit,
     take_logarithm,
+    weigh_priors,
     white_noise,
 )
 from fdi.identification.global_fit import (
@@ -390,7 +391,7 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: ScaledProble
     """
     x = scale_values(free, model.values)
     present = replace(problem, model=silence_readings(model), steps=STEPS, bare=None, _lanes={})
-    present_information = np.diag([f.prior**-2 for f in free])
+    present_information = np.diag(weigh_priors(free))
     if fit is not None:
         present_information = present_information + _measure_information(present, free, x)
     information = {}
@@ -408,7 +409,7 @@ def advise_experiments(model: Model, free: Sequence[Free], problem: ScaledProble
         runs = [_simulate(model, t.command, t.load, problem.trace.output_names) for t in (problem.trace, *problem.also)]
         noise = tuple(white_noise(model[s.noise]) for s in outputs)
         sensor_problem = replace(present, trace=runs[0], also=tuple(runs[1:]), noise=noise, _lanes={})
-        information["sensors"] = np.diag([f.prior**-2 for f in free]) + _measure_information(sensor_problem, free, x)
+        information["sensors"] = np.diag(weigh_priors(free)) + _measure_information(sensor_problem, free, x)
         what["sensors"] = f"the same runs with {' and '.join(s.symbol for s in missing)} measured"
     shares = {name: _compute_shares(free, matrix) for name, matrix in information.items()}
     for name in unseen:
@@ -660,8 +661,7 @@ class ScaledProblem(LogProblem):
         every = find_flat_directions(self, fit.free, fit.x, (pressing,), PRIORS_KNOW_MORE_MISFIT)
         more = every[:, find_flat_directions(self, fit.free, fit.x).shape[1]:]
         prior_information = np.sum((more.T / [f.prior for f in fit.free]) ** 2, axis=1)  # by what is known beforehand
-        covariance: Floats = fit.covariance + (more / prior_information) @ more.T
-        return covariance
+        return np.asarray(fit.covariance + (more / prior_information) @ more.T)
 
     def _list_ways(self, free: Sequence[Free], x: Floats) -> tuple[Mapping[str, float], ...]:
         """Directions in which an actuator of another size may change beside those of a healthy unit: powers by name."""

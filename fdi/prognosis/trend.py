@@ -195,8 +195,7 @@ def compute_covariance(data: Scaled, noise: int, wander: int, loose: float = 10.
     common, factor = NOISES[noise]
     sigma = factor * np.maximum(data.sigma, narrowest)
     own_share = np.where(np.isin(np.arange(len(sigma)), data.bounded), 1.0, 1.0 - common)
-    out: Floats = (np.diag(own_share * sigma ** 2) + OFFSET_PRIOR_SD ** 2
-                   + STEP_PRIOR_SD ** 2 * data.jumps.T @ data.jumps + compute_wander_covariance(wander, data.u, data.u))
+    out = np.diag(own_share * sigma ** 2) + _compute_cross_covariance(wander, data.u, data.jumps, data.u, data.jumps)
     out[data.loose, data.loose] += loose ** 2
     return out
 
@@ -276,10 +275,7 @@ def _compute_cross_covariance(wander: int, a: Floats, jumps_a: Floats, b: Floats
 
     `jumps_a` and `jumps_b` say which of the times are after each step, as `Scaled.jumps`.
     """
-    out = OFFSET_PRIOR_SD ** 2 + compute_wander_covariance(wander, a, b)
-    for after_a, after_b in zip(jumps_a, jumps_b, strict=True):
-        out = out + STEP_PRIOR_SD ** 2 * np.outer(after_a, after_b)
-    return out
+    return OFFSET_PRIOR_SD ** 2 + compute_wander_covariance(wander, a, b) + STEP_PRIOR_SD ** 2 * jumps_a.T @ jumps_b
 
 
 LAWS = ("none", "linear", "exponential", "power", "runaway")

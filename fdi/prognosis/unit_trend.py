@@ -223,8 +223,7 @@ def _read_answer(place: Path, again: bool) -> dict[str, Any] | None:
     """The answer stored there; None if there is none, or it is not wanted again."""
     if again or not place.is_file():
         return None
-    answer: dict[str, Any] = json.loads(place.read_text(encoding="utf-8"))
-    return answer
+    return dict(json.loads(place.read_text(encoding="utf-8")))
 
 
 def _find_answer_file(file: Path, model: Model, faults: Sequence[Fault]) -> Path:

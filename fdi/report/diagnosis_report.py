@@ -18,7 +18,6 @@ from fdi.diagnosis.precursors import (
     find_lasting_peak,
     format_precursor,
     measure_ramp,
-    read_columns,
     select_ramp_rows,
 )
 from fdi.diagnosis.refine import Beside, Explanation
@@ -620,7 +619,7 @@ def _draw_ramp(trace: Trace, ramp: RampBand, s: CommandSection, band_verdict: Ba
 
 def _find_sections(trace: Trace, bands: Bands) -> dict[int, CommandSection]:
     """The trace's sections by their number in the bands."""
-    return place_sections(bands, find_sections(read_columns(trace)[0], trace.period, bands.scale))
+    return place_sections(bands, find_sections(trace.command, trace.period, bands.scale))
 
 
 def _shade_events(events: Sequence[Event], limits: tuple[float, float], signal: str = "", unit: float = 1.0,

@@ -461,8 +461,7 @@ def _find_points(ax: Axes, artist: Any, paths: Sequence[Any]) -> Floats:
     """The corners of paths, (n, 2), with a gap after each but the last; spans end at the limits of the panel."""
     gap = [[np.nan, np.nan]]
     points = np.vstack([rows for path in paths for rows in (path.vertices, gap)][:-1])
-    corners: Floats = (artist.get_transform() - ax.transData).transform(points)
-    return corners
+    return np.asarray((artist.get_transform() - ax.transData).transform(points))
 
 
 def _make_line(points: Floats, colour: Any, width: float, dash: str = "solid") -> dict[str, Any]:

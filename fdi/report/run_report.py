@@ -55,7 +55,7 @@ from fdi.report.report import (
     tabulate,
     write_html,
 )
-from fdi.trace import CheckResult, Event, Floats, Trace, compute_speed, fill_gaps, filter_median
+from fdi.trace import CheckResult, Event, Floats, Trace, bridge_gaps, compute_speed, fill_gaps, filter_median
 from plant import EHA, UNITS, Signals, count_nouns
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
@@ -358,14 +358,9 @@ def draw_timing(trace: Trace) -> str:
 
 def _bridge_short_gaps(values: Floats) -> Floats:
     """Straight lines over up to BRIDGED missing samples: single samples between gaps would be invisible."""
-    sample_rows = np.flatnonzero(~np.isnan(values))
-    if not len(sample_rows):
+    if np.isnan(values).all():
         return values
-    rows = np.arange(len(values))
-    after = sample_rows[np.minimum(np.searchsorted(sample_rows, rows), len(sample_rows) - 1)]
-    before = sample_rows[np.maximum(np.searchsorted(sample_rows, rows, side="right") - 1, 0)]
-    is_near = (after >= rows) & (before <= rows) & (after - before <= BRIDGED + 1)
-    return np.where(is_near, np.interp(rows, sample_rows, values[sample_rows]), values)
+    return np.where(bridge_gaps(values, BRIDGED)[1], np.nan, fill_gaps(values))
 
 
 def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:

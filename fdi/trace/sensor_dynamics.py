@@ -107,8 +107,7 @@ def filter_lag(x: Floats, time: float, period: float) -> Floats:
     a, r = math.exp(-period / time), time / period
     start = x[..., :1]
     y, _ = lfilter([1.0 - r * (1.0 - a), r * (1.0 - a) - a], [1.0, -a], x - start, zi=np.zeros_like(start))
-    out: Floats = y + start
-    return out
+    return np.asarray(y + start)
 
 
 def advance_signal(x: Floats, rows: float) -> Floats:
@@ -118,8 +117,7 @@ def advance_signal(x: Floats, rows: float) -> Floats:
     ([1.5, 2.5, 3.0, 3.0], [1.0, 1.5, 2.5, 3.5])
     """
     k = np.arange(len(x))
-    out: Floats = np.interp(k + rows, k, x)
-    return out
+    return np.asarray(np.interp(k + rows, k, x))
 
 
 def _convolve(x: Floats, weights: Floats, first: int) -> Floats:

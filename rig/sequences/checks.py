@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi.trace import SPEED_SPAN, CheckResult, compute_speed, filter_median
+from fdi.trace import SPEED_SPAN, CheckResult, compute_speed, fill_gaps, filter_median
 from plant import (
     EHA,
     LONGEST,
@@ -45,16 +45,13 @@ def require_measurable(holds: object, reason: str) -> None:
         raise NotMeasurable(reason)
 
 
-def bridge_gaps(signal: Array, name: str, largest_share: float) -> Array:
+def fill_few_gaps(signal: Array, name: str, largest_share: float) -> Array:
     """The signal with missing samples (NaN) on straight lines; NotMeasurable if more than `largest_share` are NaN."""
     missing = ~np.isfinite(signal)
     count = int(missing.sum())
     require_measurable(count < len(signal), f"{name} was not measured")
     require_measurable(count <= largest_share * len(signal), f"{count} of {len(signal)} samples of {name} are missing")
-    if not count:
-        return signal
-    rows = np.arange(len(signal))
-    return np.interp(rows, rows[~missing], signal[~missing])
+    return fill_gaps(np.where(missing, np.nan, signal))
 
 
 SMALLEST_STEP = 20e-6  # m where a plant's command is at most 1 m, else in proportion; ten times the noise of the EHA
@@ -219,7 +216,7 @@ class RunData:
             require_measurable(span.stop - span.start >= 2, "one sample has no speed")
             return compute_speed(self.read_signal(controlled, span), self.rate, self.speed_span)
         require_measurable(hasattr(self.trace, name), f"the plant has no signal {name}")
-        return bridge_gaps(np.asarray(getattr(self.trace, name), float)[span], name, largest_missing_share)
+        return fill_few_gaps(np.asarray(getattr(self.trace, name), float)[span], name, largest_missing_share)
 
     def count_missing(self, name: str, span: slice) -> int:
         """How many samples of a signal were bridged."""
@@ -496,8 +493,7 @@ class Window:
     @property
     def error(self) -> Array:
         """Demand minus controlled signal, SI."""
-        error: Array = vars(self)[self._signals.command.name] - vars(self)[self._signals.controlled.name]
-        return error
+        return np.asarray(vars(self)[self._signals.command.name] - vars(self)[self._signals.controlled.name])
 
 
 def _measure_python(check: PythonCheck, run: RunData, span: slice) -> float:

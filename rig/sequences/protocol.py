@@ -219,8 +219,7 @@ def find_states(rows: Rows, words: ProfileWords) -> Whole:
 
 def _find_active(rows: Rows, words: ProfileWords) -> Mask:
     """The cycles whose control word asks for ACTIVE."""
-    active: Mask = map_words(rows.control, lambda word: find_wanted(words, word)) == State.ACTIVE
-    return active
+    return np.asarray(map_words(rows.control, lambda word: find_wanted(words, word)) == State.ACTIVE)
 
 
 def find_idle(rows: Rows, words: ProfileWords, limits: ProtocolLimits, rate: float) -> Mask:
@@ -239,8 +238,7 @@ def find_idle(rows: Rows, words: ProfileWords, limits: ProtocolLimits, rate: flo
 def _find_over(active: Mask, delay: int) -> Mask:
     """The cycles that are not active and that follow none that is by `delay` cycles or less."""
     count, k = np.concatenate(([0], np.cumsum(active))), np.arange(len(active))
-    over: Mask = count[k + 1] == count[np.maximum(k - delay, 0)]
-    return over
+    return np.asarray(count[k + 1] == count[np.maximum(k - delay, 0)])
 
 
 def _judge_status(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:

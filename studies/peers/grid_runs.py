@@ -90,8 +90,7 @@ def _make_own_replay(work: Work, workers: int | None) -> Replay:
 
     def reduce_to_rms(runs: Array) -> Array:
         error = runs[:, 0].T - work.position[:, None]
-        rms: Array = np.sqrt(np.einsum("ij,ij->j", error, error) / len(error))
-        return rms
+        return np.asarray(np.sqrt(np.einsum("ij,ij->j", error, error) / len(error)))
 
     return lambda: monitor.replay(work.values, work.current, work.position, ANCHOR, reduced=reduce_to_rms)
 
@@ -106,8 +105,7 @@ def _make_reference_replay(work: Work) -> Replay:
 def _measure_rms(xj: Array, work: Work) -> Array:
     """RMS error of positions (m, n) against the measured ones, (m,) m."""
     error = xj - work.position[:xj.shape[1]]
-    rms: Array = np.sqrt(np.einsum("ij,ij->i", error, error) / error.shape[1])
-    return rms
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", error, error) / error.shape[1]))
 
 
 def _make_c_replay(work: Work, flags: tuple[str, ...], target: Path) -> Replay:

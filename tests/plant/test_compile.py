@@ -48,7 +48,7 @@ file = Path(sys.argv[1])
 load_effects(file)
 if len(sys.argv) > 2:  # somebody edits it after it was read, before it is compiled
     file.write_text(Path(sys.argv[2]).read_text())
-print(json.dumps(compute_answers(Model().replace({"hold.share": 0.4}), np.full(60, 1e-3), np.zeros(60)).tolist()))
+print(json.dumps(compute_answers(Model().replace({"hold.share": 0.4}), np.full(60, 1e-3), np.zeros((60, 3))).tolist()))
 """
 
 

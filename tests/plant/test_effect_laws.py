@@ -315,7 +315,7 @@ def test_the_rigs_own_firmware_limits_the_rate_too() -> None:
 def test_the_firmware_alone_answers_as_in_the_loop(changes: dict[str, float]) -> None:
     model = Model().replace(changes)
     run = simulate(model, COMMAND, seed=2)
-    assert (compute_answers(model, COMMAND, run.xj) == run.cor).all()
+    assert (compute_answers(model, COMMAND, np.column_stack([run.xj, run.p12, run.xs])) == run.cor).all()
 
 
 def test_a_heavy_body_on_its_mount_rings_as_its_equation_says() -> None:

@@ -340,7 +340,7 @@ def test_a_switching_valve_stops_the_flow_at_each_reversal_and_not_at_the_start(
 
 def test_an_asymmetric_gain_answers_a_negative_error_less() -> None:
     model = build_model(asymmetric_gain__retraction=-0.3)
-    answers = compute_answers(model, np.array([1e-3, -1e-3, 0.0]), np.zeros(3))
+    answers = compute_answers(model, np.array([1e-3, -1e-3, 0.0]), np.zeros((3, 3)))
     np.testing.assert_allclose(answers / model["controller.proportional_gain"], [1e-3, -0.7e-3, 0.0], rtol=1e-12)
 
 

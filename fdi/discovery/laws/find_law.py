@@ -516,8 +516,7 @@ def _predict_folds(place: Places, fold: Places, y: Floats) -> Floats:
     count = np.bincount(group, minlength=bins * FOLDS).reshape(bins, FOLDS, 1)
     mean = (sums.sum(axis=1, keepdims=True) - sums) / (count.sum(axis=1, keepdims=True) - count + 5.0)  # shrunk to zero
     error = (y**2).sum(axis=0) - (2.0 * mean * sums - mean**2 * count).sum(axis=(0, 1))
-    share: Floats = 1.0 - error / np.maximum((y**2).sum(axis=0), 1e-300)
-    return share
+    return np.asarray(1.0 - error / np.maximum((y**2).sum(axis=0), 1e-300))
 
 
 def _predict_holdout(choice: Sequence[str], y: Floats, states: Mapping[str, Floats],

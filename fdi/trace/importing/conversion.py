@@ -440,8 +440,7 @@ def _make_rows(import_map: ImportMap, samples: Mapping[str, Samples], period: fl
             f"{', '.join(import_map.declared.required)} recorded at the same time")
     require(count <= MOST_ROWS, import_map.path, "time",
             f"at most {MOST_ROWS} rows of {period:g} s, not {count}; is the unit of the time right?")
-    out: Floats = start + period * np.arange(count)
-    return out
+    return np.asarray(start + period * np.arange(count))
 
 
 def _find_sensor(signal: SignalMap, samples: Samples, rows: Floats, how: str, period: float, unit: str

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.thresholds import LEAST_QUANTUM_NOISE, LEAST_SCALING_CORRELATION, LEAST_SPEED_CORRELATION
-from fdi.trace import Floats, find_comb
+from fdi.trace import Floats, find_comb, hold_last
 from fdi.trace.importing.formats import OTHER_UNITS, Channel, Measurement, split_unit
 from plant import EHA, UNITS, InputError, Signal, Signals, Unit, find_unit, fit_unit, load_nominal_values, quote_text
 
@@ -136,8 +136,7 @@ def _read_numbers(measurement: Measurement) -> dict[str, Floats]:
         x = channel.values[:SAMPLE]
         places = np.flatnonzero(~np.isnan(x))
         if len(places) > 1:
-            last = np.clip(np.searchsorted(places, np.arange(len(x)), side="right") - 1, 0, None)
-            out[name] = x[places[last]]
+            out[name] = hold_last(np.append(x[places[0]], x))[1:]
     return out
 
 

@@ -4,8 +4,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,6 +44,7 @@ from fdi.estimation import (
     read_cycles,
     replay_current,
     scale_to,
+    start_fit,
     white_noise,
 )
 from fdi.estimation.replay import FEWEST_ROWS, PERIODS, find_rest_rows
@@ -397,8 +397,8 @@ def _find(changes: dict[str, float], com: np.ndarray) -> np.ndarray:
     model = complete_model(Model()).replace(changes)
     trace = hold_inputs(record_plant(changes, com, seed=1))
     problem = Problem(model, trace, tuple(white_noise(FLOOR[s]) for s in trace.outputs), steps=20)
-    fit = SimpleNamespace(free=list_tolerance_unknowns(model), values={})
-    return find_undecided_rows(problem, cast(Fit, cast(Any, fit)), FLOOR)
+    free = list_tolerance_unknowns(model)
+    return find_undecided_rows(problem, start_fit(free, np.zeros(len(free))), FLOOR)
 
 
 @pytest.mark.parametrize("is_told", [True, False])
