@@ -31,7 +31,9 @@ from .bench_report import (
 from .calibration import WIDTHS as WIDTHS, Decision as Decision, SensorCalibration as SensorCalibration
 from .can_map import read_database as read_database
 from .canopen_map import (
+    EVENT_DRIVEN as EVENT_DRIVEN,
     INVALID as INVALID,
+    LAST_SYNCHRONOUS as LAST_SYNCHRONOUS,
     MAPPING as MAPPING,
     PARAMETERS as PARAMETERS,
     RPDO as RPDO,
@@ -75,6 +77,7 @@ from .packing import (
     make_layout as make_layout,
     pack_frame as pack_frame,
     read_cycle_number as read_cycle_number,
+    to_integer as to_integer,
     unpack_frame as unpack_frame,
 )
 from .profiles import (

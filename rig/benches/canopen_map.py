@@ -18,7 +18,7 @@ LONG = 1 << 29  # in a COB-ID: the identifier has 29 bits
 RPDO, TPDO, MAPPING = 0x1400, 0x1800, 0x200  # communication parameters; the mapping is MAPPING further on
 PARAMETERS = frozenset((*range(RPDO, RPDO + MAPPING), *range(TPDO, TPDO + MAPPING)))
 _LONGEST = 64  # bits of a PDO
-_EVENT = (254, 255)  # transmission types
+LAST_SYNCHRONOUS, EVENT_DRIVEN = 240, (254, 255)  # transmission types of PDOs (CiA 301, table 70)
 _KINDS = {datatypes.BOOLEAN: Kind.UNSIGNED, datatypes.REAL32: Kind.FLOAT, datatypes.REAL64: Kind.FLOAT,
           **dict.fromkeys(datatypes.SIGNED_TYPES, Kind.SIGNED),
           **dict.fromkeys(datatypes.UNSIGNED_TYPES, Kind.UNSIGNED)}
@@ -44,6 +44,11 @@ class Pdo(NamedTuple):
     def length(self) -> int:
         """Bits."""
         return sum(bits for _, _, bits in self.entries)
+
+    @property
+    def is_cyclic(self) -> bool:
+        """Whether it goes with each n-th SYNC, n being its type."""
+        return 1 <= self.kind <= LAST_SYNCHRONOUS
 
 
 def parse_object(text: str) -> tuple[int, int] | None:
@@ -114,9 +119,7 @@ def read_number(dictionary: Any, index: int, sub: int) -> int | None:
 
 def _find_value(variable: ODVariable | None) -> object:
     """What an object holds after a reset, or what the DCF writes; None if the file gives neither."""
-    if variable is None:
-        return None
-    return variable.default if variable.value is None else variable.value
+    return None if variable is None else variable.default if variable.value is None else variable.value
 
 
 def find_sync(dictionary: Any) -> int:
@@ -170,11 +173,11 @@ def map_pdos(name: str, dictionary: Any, node: int, uses: Mapping[str, Use]) -> 
         _check_object(name, dictionary, key, use)
         if not any(key in keys and use.is_received in (pdo.is_received, None) for pdo, keys in valid_pdos):
             raise use.place.refuse(_describe_unmapped(dictionary, pdos, key, use))
-    synchronous_keys = {key for pdo, keys in valid_pdos for key in keys if not pdo.is_received and 1 <= pdo.kind <= 240}
+    synchronous_keys = {key for pdo, keys in valid_pdos for key in keys if not pdo.is_received and pdo.is_cyclic}
     awaited_keys = {key for key, use in uses.items() if use.is_needed} - synchronous_keys  # only this PDO brings them
     for pdo, keys in valid_pdos:
         if used_keys := {key for key in keys if key in uses and uses[key].is_received in (pdo.is_received, None)}:
-            is_answer = 1 <= pdo.kind <= 240 or (pdo.kind in _EVENT and not awaited_keys.isdisjoint(used_keys))
+            is_answer = pdo.is_cyclic or (pdo.kind in EVENT_DRIVEN and not awaited_keys.isdisjoint(used_keys))
             yield _map_pdo(name, dictionary, pdo, used_keys, is_answer=is_answer)
 
 
@@ -220,7 +223,7 @@ def _map_pdo(name: str, dictionary: Any, pdo: Pdo, used_keys: set[str], *, is_an
     """The frame of a PDO; only the objects of `used_keys` keep their names."""
     where = f"0x{pdo.mapping:04X}"
     require(0 < pdo.length <= _LONGEST, name, where, f"at most 8 bytes in {pdo.name}, not {pdo.length} bits")
-    require(0 <= pdo.kind <= 240 or pdo.kind in _EVENT, name, f"0x{pdo.parameter:04X}:2",
+    require(0 <= pdo.kind <= LAST_SYNCHRONOUS or pdo.kind in EVENT_DRIVEN, name, f"0x{pdo.parameter:04X}:2",
             f"a transmission type 0 to 240, 254 or 255 for {pdo.name}, not {pdo.kind}")
     slots, lowest = [], 0
     for index, sub, length in pdo.entries:
@@ -238,8 +241,8 @@ def _map_pdo(name: str, dictionary: Any, pdo: Pdo, used_keys: set[str], *, is_an
     return DeviceFrame(slots=tuple(slots), spec=FrameSpec(
         name=pdo.name, identifier=_read_identifier(pdo.cob_id), length=(lowest + 7) // 8,
         sender=Role.RIG if pdo.is_received else Role.CONTROLLER,
-        every=pdo.kind if not pdo.is_received and 1 <= pdo.kind <= 240 else 1,
-        is_before_sync=pdo.is_received and pdo.kind <= 240, is_answer=is_answer or pdo.is_received))
+        every=pdo.kind if not pdo.is_received and pdo.is_cyclic else 1,
+        is_before_sync=pdo.is_received and pdo.kind <= LAST_SYNCHRONOUS, is_answer=is_answer or pdo.is_received))
 
 
 def read_start(variable: ODVariable | None) -> float:

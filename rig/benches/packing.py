@@ -147,8 +147,8 @@ def _find_mask(bits: int) -> int:
     return -1 if bits == 64 else (1 << bits) - 1
 
 
-def _integer(value: Any) -> int:
-    """A word as the integer that compiled code and Python calculate alike with."""
+def to_integer(value: Any) -> int:
+    """A number of an array as the integer that compiled code and Python calculate alike with: 64 bits, signed."""
     return int(np.int64(value))
 
 
@@ -160,7 +160,7 @@ def _write_bits(m: Layout, field: int, bits: int) -> None:
         octet, shift = 8 * PAYLOAD + place // 8, place % 8
         count = min(8 - shift, remaining_bits)
         mask = (1 << count) - 1
-        octets[octet] = _integer(octets[octet]) & ~(mask << shift) & 0xFF | (bits & mask) << shift
+        octets[octet] = to_integer(octets[octet]) & ~(mask << shift) & 0xFF | (bits & mask) << shift
         bits >>= count
         remaining_bits -= count
         place = _find_next_byte(m, field, place)
@@ -174,14 +174,14 @@ def _read_bits(m: Layout, field: int) -> int:
     while remaining_bits > 0:
         shift = place % 8
         count = min(8 - shift, remaining_bits)
-        part = _integer(m.octets[8 * PAYLOAD + place // 8]) >> shift & (1 << count) - 1
+        part = to_integer(m.octets[8 * PAYLOAD + place // 8]) >> shift & (1 << count) - 1
         if position + count == 64 and part >> count - 1:  # the sign, which Python's shift does not set
             part -= 1 << count
         bits |= part << position
         position += count
         remaining_bits -= count
         place = _find_next_byte(m, field, place)
-    return _integer(bits)
+    return to_integer(bits)
 
 
 def _find_next_byte(m: Layout, field: int, place: int) -> int:
@@ -200,7 +200,7 @@ def _encode(m: Layout, field: int, value: float) -> int:
         else:
             words[_SCRATCH] = 0
             m.singles[2 * _SCRATCH] = counts
-        return _integer(words[_SCRATCH])
+        return to_integer(words[_SCRATCH])
     if counts >= doubles[field + _HIGH]:
         return _find_mask(words[field + _BITS] - (words[field + _KIND] == _SIGNED))
     counts = np.rint(max(counts, doubles[field + _LOW]))
@@ -235,18 +235,18 @@ def _compute_checksum(m: Layout, at: int, field: int, counter: int) -> int:
     if words[field + _FIXED]:
         _call_checksum(words[field + _FIXED], base + 8 * _SCRATCH, base + 8 * (_SCRATCH + 1),
                        0, 0, length, 1, base + 8 * PAYLOAD, length, 1, counter)
-        return _integer(words[_SCRATCH]) & _find_mask(words[field + _BITS])
+        return to_integer(words[_SCRATCH]) & _find_mask(words[field + _BITS])
     crc, polynomial, checksum_byte = words[field + _START], words[field + _POLYNOMIAL], words[field + _LOWEST] // 8
     if words[field + _DATA_ID] >= 0:
         crc = add_byte(crc, words[field + _DATA_ID] & 0xFF, polynomial)
         crc = add_byte(crc, words[field + _DATA_ID] >> 8, polynomial)
     for i in range(length):
         if i != checksum_byte:
-            crc = add_byte(crc, _integer(m.octets[8 * PAYLOAD + i]), polynomial)
+            crc = add_byte(crc, to_integer(m.octets[8 * PAYLOAD + i]), polynomial)
     if words[field + _DATA_IDS_AT]:
         ids = words[field + _DATA_IDS_AT]
         crc = add_byte(crc, words[ids + 1 + counter % words[ids]], polynomial)
-    return _integer(crc ^ words[field + _INVERSION])
+    return to_integer(crc ^ words[field + _INVERSION])
 
 
 # ---------------------------------------------------------------------------------------- made before the start

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-from rig.benches import INVALID, Pdo
+from rig.benches import INVALID, LAST_SYNCHRONOUS, Pdo
 from rig.conformance.target import (
     CANNOT_MAP,
     COMMANDS,
@@ -30,7 +30,6 @@ from rig.conformance.target import (
 from rig.network import Frame
 
 EXTENDED, PRODUCER = 1 << 29, 1 << 30  # in a COB-ID: 29 bits; in that of SYNC: the node sends it
-LAST_SYNCHRONOUS = 240
 TOO_SHORT, TOO_LONG = 0x8210, 0x8220  # error codes
 SETTLE = 0.1  # s: the time in which a frame that is not expected would come
 

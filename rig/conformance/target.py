@@ -302,14 +302,13 @@ class Target:
         """An unsigned integer object. Raises Refusal, Problem."""
         return int.from_bytes(self.upload(index, sub), "little")
 
-    def write(self, index: int, sub: int, value: Number) -> None:
-        """Write a number into an object of the EDS. Raises Refusal, Problem."""
-        self.download(index, sub, self.variable(index, sub).encode(value))
+    def write(self, index: int, sub: int, value: bytes | Number) -> None:
+        """Write bytes, or a number into an object of the EDS. Raises Refusal, Problem."""
+        self.download(index, sub, value if isinstance(value, bytes) else self.variable(index, sub).encode(value))
 
     def try_download(self, index: int, sub: int, value: bytes | int) -> int:
         """Write bytes, or a number into an object of the EDS; the abort code, 0 if it was accepted."""
-        data = value if isinstance(value, bytes) else self.variable(index, sub).encode(value)
-        return find_abort(self.download, index, sub, data)
+        return find_abort(self.write, index, sub, value)
 
     def require_value(self, variable: Variable, data: bytes, problem: str) -> None:
         """Raises Problem unless the object holds these bytes."""
@@ -546,11 +545,22 @@ class Variable(NamedTuple):
     def change(self, data: bytes) -> bytes:
         """Other bytes of the same length, within the limits: by the smallest step where that is possible.
 
-        Raises Problem if there are none.
+        Raises Problem if there are no bytes, CaseNotApplicable if they are the only ones within the limits.
+
+        >>> variable = Variable(0x2000, 0, datatypes.UNSIGNED8, "rw", None, low=7, high=8, is_mappable=False)
+        >>> variable.change(bytes([7])), variable.change(bytes([8]))
+        (b'\\x08', b'\\x07')
+        >>> variable._replace(high=7).change(bytes([7]))
+        Traceback (most recent call last):
+        rig.conformance.target.CaseNotApplicable: 0x2000:0 has no other value within its limits
         """
         require(data, f"{self.label} has 0 bytes")
-        offers = (bytes((data[0] ^ bits,)) + data[1:] for bits in (1, 2, 3))
-        return next((offer for offer in offers if len(data) != self.size or self.is_inside(self.decode(offer))), data)
+        offers = (*(bytes((data[0] ^ bits,)) + data[1:] for bits in (1, 2, 3)),
+                  *(self.encode(end) for end in (self.low, self.high) if end is not None and self.can_hold(end)))
+        other = next((offer for offer in offers if offer != data
+                      and (len(data) != self.size or self.is_inside(self.decode(offer)))), b"")
+        require_applicable(other, f"{self.label} has no other value within its limits")
+        return other
 
     @property
     def default_bytes(self) -> bytes | None:

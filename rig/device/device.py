@@ -50,7 +50,8 @@ class Device:
         self.nmt = Nmt(node_id, self._enter, self._restart)
         self.emcy = Emcy(self.od, send, lambda: self.nmt.state in _COMMUNICATING)
         self.heartbeat = HeartbeatProducer(node_id, send)
-        self.consumer = HeartbeatConsumer(self._heartbeat_lost, self._heartbeat_back)
+        self.consumer = HeartbeatConsumer(
+            self._heartbeat_lost, lambda node: self.emcy.clear(EmcyCode.HEARTBEAT_LOST, bytes((node,))))
         self.sync = SyncConsumer(self.emcy, self._cycle, lambda: self.on_sync_lost())
         self.sdo = SdoServer(0x580 + node_id, send, self._upload, self.od.find_size, self._download)
         self.pdo = Pdos(self.od, self.emcy, send, lambda n: self.on_rpdo(n))
@@ -183,6 +184,3 @@ class Device:
         self.emcy.raise_error(EmcyCode.HEARTBEAT_LOST, ErrorRegister.COMMUNICATION, bytes((node,)))
         self.nmt.communication_error(self.od.read_number(0x1029, 1))
         self.on_heartbeat_lost(node)
-
-    def _heartbeat_back(self, node: int) -> None:
-        self.emcy.clear(EmcyCode.HEARTBEAT_LOST, bytes((node,)))

@@ -7,7 +7,7 @@ from typing import cast
 from canopen.objectdictionary import ODVariable, datatypes
 
 from plant import read_file, require
-from rig.benches import decode_device_text, list_variables, read_dictionary
+from rig.benches import INVALID, decode_device_text, list_variables, read_dictionary
 from rig.device.sdo import Abort, SdoAbort, abort_unless
 
 Value = int | float | bytes
@@ -102,7 +102,6 @@ def _load(path: Path, node_id: int) -> dict[tuple[int, int], ODVariable]:
     return entries
 
 
-INVALID = 1 << 31  # PDO and EMCY: switched off
 PRODUCER = 1 << 30  # 0x1005: the node sends SYNC
 _CAN_ID = 0x7FF
 _UNUSED = 0x3FFFF800  # bit 29 asks for a 29-bit identifier, whose bits follow

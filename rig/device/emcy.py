@@ -6,7 +6,8 @@ from enum import IntEnum, IntFlag
 from functools import reduce
 from operator import or_
 
-from rig.device.dictionary import INVALID, Dictionary
+from rig.benches import INVALID
+from rig.device.dictionary import Dictionary
 
 _FRAME = struct.Struct("<HB5s")
 REGISTER, HISTORY, COB_ID = 0x1001, 0x1003, 0x1014

@@ -7,14 +7,11 @@ import struct
 from collections.abc import Callable
 
 from plant import InputError, require
-from rig.benches import MAPPING, RPDO, TPDO
-from rig.device.dictionary import INVALID, Dictionary, check_switchable, find_struct
+from rig.benches import EVENT_DRIVEN, INVALID, LAST_SYNCHRONOUS, MAPPING, RPDO, TPDO
+from rig.device.dictionary import Dictionary, check_switchable, find_struct
 from rig.device.emcy import Emcy, EmcyCode, ErrorRegister
 from rig.device.sdo import Abort, abort_unless
 from rig.network import Frame, Send
-
-_LAST_SYNCHRONOUS = 240
-_EVENT_DRIVEN = (254, 255)
 
 
 def read_mapping(od: Dictionary, index: int) -> tuple[list[tuple[int, int]], struct.Struct]:
@@ -55,7 +52,7 @@ class Pdo:
         word = self._od.read_number(self._index, 1)
         self.cob_id = None if word & INVALID else word & 0x7FF
         self._type = self._od.read_number(self._index, 2)
-        self.synchronous = self._type <= _LAST_SYNCHRONOUS
+        self.synchronous = self._type <= LAST_SYNCHRONOUS
 
 
 class Rpdo(Pdo):
@@ -128,7 +125,7 @@ class Tpdo(Pdo):
 
     def transmit(self) -> None:
         """The application asks for it. A cyclic synchronous PDO keeps to its SYNCs."""
-        if self._type in _EVENT_DRIVEN:
+        if self._type in EVENT_DRIVEN:
             self.send()
         else:
             self._requested = True
@@ -182,4 +179,4 @@ class Pdos:
             is_free = value & 0x7FF != self._od.read_number(0x1005, 0, 0x80) & 0x7FF
             abort_unless(value & INVALID or is_free, Abort.VALUE)
         elif sub == 2:  # those between are reserved, or by remote frame
-            abort_unless(value <= _LAST_SYNCHRONOUS or value >= _EVENT_DRIVEN[0], Abort.VALUE)
+            abort_unless(value <= LAST_SYNCHRONOUS or value >= EVENT_DRIVEN[0], Abort.VALUE)

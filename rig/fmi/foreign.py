@@ -171,32 +171,30 @@ class Unit:
     def _ask(self, name: str, *arguments: Any) -> Any:
         """The answer of the process. Raises Diverged: the unit refuses. Raises RigError: it crashes or hangs."""
         with self._lock:  # analyses run in threads
-            return self._ask_alone(name, arguments)
-
-    def _ask_alone(self, name: str, arguments: Sequence[Any]) -> Any:
-        if self._hangs:
-            raise RigError(self._hangs)
-        if self._process is None:
-            self._start()
-        process, connection = self._process, self._connection
-        assert process is not None and connection is not None
-        with contextlib.suppress(OSError, EOFError):
-            connection.send((name, arguments))
-            if connection.poll(LONGEST_CALL):
-                word, result = connection.recv()
-                if word == "done":
-                    return result
+            if self._hangs:
+                raise RigError(self._hangs)
+            if self._process is None:
+                self._start()
+            process, connection = self._process, self._connection
+            assert process is not None and connection is not None
+            with contextlib.suppress(OSError, EOFError):
+                connection.send((name, arguments))
+                if connection.poll(LONGEST_CALL):
+                    word, result = connection.recv()
+                    if word == "done":
+                        return result
+                    self.close()
+                    raise Diverged(f"{self._path}: {result}")
                 self.close()
-                raise Diverged(f"{self._path}: {result}")
+                self._hangs = (f"{self._path}: the unit has not answered for {LONGEST_CALL:g} s in {name}; "
+                               "it was stopped")
+                raise RigError(self._hangs)
+            status = process.wait()
             self.close()
-            self._hangs = f"{self._path}: the unit has not answered for {LONGEST_CALL:g} s in {name}; it was stopped"
-            raise RigError(self._hangs)
-        status = process.wait()
-        self.close()
-        cause = signals_of_processes.Signals(-status).name if status < 0 else f"exit status {status}"
-        message_lines = Path(self._folder.name, "messages.txt").read_text(errors="replace").split("\n")
-        last = next((f"; its last message: {line.strip()}" for line in reversed(message_lines) if line.strip()), "")
-        raise RigError(f"{self._path}: the unit crashed in {name} ({cause}){last}")
+            cause = signals_of_processes.Signals(-status).name if status < 0 else f"exit status {status}"
+            message_lines = Path(self._folder.name, "messages.txt").read_text(errors="replace").split("\n")
+            last = next((f"; its last message: {line.strip()}" for line in reversed(message_lines) if line.strip()), "")
+            raise RigError(f"{self._path}: the unit crashed in {name} ({cause}){last}")
 
     def _start(self) -> None:
         """Unpack the unit, and load it in a process of its own."""

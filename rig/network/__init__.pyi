@@ -63,7 +63,6 @@ from .raw_bus import (
     send_frame as send_frame,
     send_payload as send_payload,
     sleep_until as sleep_until,
-    to_integer as to_integer,
 )
 from .sdo_client import (
     ABORT as ABORT,

@@ -196,7 +196,7 @@ def parse_spec(spec: str, where: str) -> tuple[str, str]:
 _CAN_FRAME, _CANFD_FRAME = struct.Struct("=IBxxx8s"), struct.Struct("=IBBxx64s")  # linux/can.h
 _SWITCHED = 1  # CANFD_BRS
 _TIMESPEC = struct.Struct("@qq")
-_CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
+CONTROLLER_ERROR, RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
 _FILTER = struct.Struct("=II")  # struct can_filter: identifier, mask
 _INVERTED = 0x20000000
@@ -207,12 +207,12 @@ class Link:
     """Frames of one bus, with the times of `clock` (ns since the run began). The link owns the bus.
 
     Counted, to be read at any time: `error_frames` of the controller; `overflows`, frames lost on the way in;
-    `dropped`, remote frames; `unsent`, frames the full transmit queue refused. On socketcan CAN FD frames come, and can
-    be sent, if the bus was opened with fd=True.
+    `unsent`, frames the full transmit queue refused. Remote frames are left out. On socketcan CAN FD frames come, and
+    can be sent, if the bus was opened with fd=True.
     """
 
     def __init__(self, bus: can.BusABC, clock: Callable[[], int]) -> None:
-        self.error_frames = self.dropped = self.unsent = 0
+        self.error_frames = self.unsent = 0
         self._bus, self._clock = bus, clock
         self._in_controller = self._in_kernel = 0  # where frames overflowed
         self._latest = 0  # ns: a frame came no earlier than the one before, even if somebody has set the clock since
@@ -292,13 +292,11 @@ class Link:
         message = self._bus.recv(timeout)
         while message is not None:
             cob_id = find_cob_id(message) & ~SWITCHED
-            if message.is_error_frame:
+            is_remote = message.is_remote_frame
+            if message.is_error_frame or (not is_remote and not has_valid_length(cob_id, len(message.data))):
                 self.error_frames += 1
-            elif message.is_remote_frame:
-                self.dropped += 1
-            elif not has_valid_length(cob_id, len(message.data)):
-                self.error_frames += 1
-            elif cob_id not in self._left_out and (self._selection is None or cob_id in self._selection):
+            elif (not is_remote and cob_id not in self._left_out
+                  and (self._selection is None or cob_id in self._selection)):
                 yield Frame(self._clock(), cob_id, bytes(message.data))
             message = self._bus.recv(0)
 
@@ -323,10 +321,8 @@ class Link:
             identifier, length, payload = int.from_bytes(data[:4], sys.byteorder), data[4], data[8:]
             if identifier & socket.CAN_ERR_FLAG:
                 self.error_frames += 1
-                self._in_controller += bool(identifier & _CONTROLLER and payload[1] & _RX_OVERFLOW)
-            elif identifier & socket.CAN_RTR_FLAG:
-                self.dropped += 1
-            else:
+                self._in_controller += bool(identifier & CONTROLLER_ERROR and payload[1] & RX_OVERFLOW)
+            elif not identifier & socket.CAN_RTR_FLAG:
                 kind = FD if len(data) == _CANFD_FRAME.size else 0
                 frames.append(Frame(t_ns, identifier | kind, payload[:length]))
 

@@ -5,7 +5,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Annotated, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,11 +112,9 @@ _TEXTS = ("name", "hardware", "software")
 
 def read_identity(upload: Callable[[int, int], bytes | None]) -> Identity:
     """The identity of a node; `upload(index, sub)` gives an object's bytes, None where the node has no such object."""
-    objects = {key: upload(*place) for key, place in _OBJECTS.items()}
-    texts = {key: _decode_text(data) for key, data in objects.items() if data is not None and key in _TEXTS}
-    numbers = {key: int.from_bytes(data[:4], "little") for key, data in objects.items()
-               if data is not None and key not in _TEXTS}
-    return Identity(**texts, **numbers)  # type: ignore[arg-type]  # the keys are the fields, with their types
+    known: Any = {key: _decode_text(data) if key in _TEXTS else int.from_bytes(data[:4], "little")
+                  for key, place in _OBJECTS.items() if (data := upload(*place)) is not None}
+    return Identity(**known)
 
 
 def _decode_text(data: bytes, longest: int = 64) -> str:

@@ -37,7 +37,7 @@ import socket
 import struct
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import can
 import msgpack  # type: ignore[import-untyped]
@@ -46,8 +46,8 @@ from can.interfaces.udp_multicast.utils import pack_message
 from numpy.typing import NDArray
 
 from plant import ForeignCall, RigError, bind_later, keep_apart, require
-from rig.benches import EXTENDED, FD, SWITCHED
-from rig.network.bus import can_open, parse_spec, require_interface
+from rig.benches import EXTENDED, FD, SWITCHED, to_integer
+from rig.network.bus import CONTROLLER_ERROR, RX_OVERFLOW, can_open, parse_spec, require_interface
 from rig.network.frame import IDENTIFIER, has_valid_length
 from rig.network.udp import (
     FLOCK,
@@ -89,7 +89,6 @@ PAYLOAD_IN, PAYLOAD_OUT = _FRAME_IN + 8, _FRAME_OUT + 8  # 64 bytes each
 _SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_ERR_FILTER, _CAN_RAW_FD_FRAMES = 101, 1, 2, 5
 _RTR, _ERR, _CANFD_BRS = 0x40000000, 0x20000000, 1  # linux/can.h: remote and error frames; bit of canfd_frame.flags
 _DONTWAIT, _POLLIN = 0x40, 1
-_CONTROLLER, _RX_OVERFLOW = 0x4, 0x1  # linux/can/error.h: class of the identifier, bit of data[1]
 _REALTIME, _MONOTONIC, _ABSOLUTE = 0, 1, 1
 
 _recvmsg = ForeignCall("qiqi", "recvmsg")
@@ -110,19 +109,18 @@ class Port(NamedTuple):
     octets: NDArray[np.uint8]
 
 
-def to_integer(value: Any) -> int:
-    """A number of an array as the integer that compiled code and Python calculate alike with: 64 bits, signed."""
-    return int(np.int64(value))
-
-
 # ---------------------------------------------------------------------------------------- time
+
+
+def _read_clock(port: Port, which: int) -> int:
+    _clock_gettime(which, port.octets.ctypes.data + _TIME)
+    return to_integer(port.words[_TIME // 8] * 1_000_000_000 + port.words[_TIME // 8 + 1])
 
 
 @bind_later
 def read_clock(port: Port) -> int:
     """CLOCK_MONOTONIC, ns."""
-    _clock_gettime(_MONOTONIC, port.octets.ctypes.data + _TIME)
-    return to_integer(port.words[_TIME // 8] * 1_000_000_000 + port.words[_TIME // 8 + 1])
+    return _read_clock(port, _MONOTONIC)
 
 
 @bind_later
@@ -132,11 +130,6 @@ def sleep_until(port: Port, t_ns: int) -> None:
     port.words[_TIME // 8 + 1] = t_ns % 1_000_000_000
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, port.octets.ctypes.data + _TIME, 0) == errno.EINTR:
         pass
-
-
-def _read_wall_clock(port: Port) -> int:
-    _clock_gettime(_REALTIME, port.octets.ctypes.data + _TIME)
-    return to_integer(port.words[_TIME // 8] * 1_000_000_000 + port.words[_TIME // 8 + 1])
 
 
 # ---------------------------------------------------------------------------------------- receive
@@ -257,7 +250,7 @@ def _find_clock_distance(port: Port) -> int:
     distance, shortest = 0, 1 << 62
     for _ in range(5):
         before = read_clock(port)
-        wall = _read_wall_clock(port)
+        wall = _read_clock(port, _REALTIME)
         duration = read_clock(port) - before
         if duration < shortest:
             distance, shortest = wall - before - duration // 2, duration
@@ -272,7 +265,7 @@ def _decode(port: Port, size: int) -> tuple[int, int, int]:
         return decode_datagram(port, size)
     cob_id = to_integer(port.halves[_FRAME_IN // 4]) & 0xFFFFFFFF
     if cob_id & _ERR:
-        port.words[_IN_CONTROLLER] += cob_id & _CONTROLLER != 0 and port.octets[PAYLOAD_IN + 1] & _RX_OVERFLOW != 0
+        port.words[_IN_CONTROLLER] += cob_id & CONTROLLER_ERROR != 0 and port.octets[PAYLOAD_IN + 1] & RX_OVERFLOW != 0
     if cob_id & (_ERR | _RTR) or size not in (_CAN_SIZE, _CANFD_SIZE):
         return -1, 0, 0
     most = 8

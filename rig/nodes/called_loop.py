@@ -5,13 +5,14 @@ stored on disk and runs without numba (plant/machine_code.py).
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
 from plant import StoredCode, compile_function, find_code_folder, keep_apart
-from rig.network import PAYLOAD_OUT, QUEUE_FULL, SENT, TIMEOUT, Port, to_integer
+from rig.benches import to_integer
+from rig.network import PAYLOAD_OUT, QUEUE_FULL, SENT, TIMEOUT, Port
 
 # Words of the port behind the payloads: the time, how many frames are to be sent, and these: identifier, length and 8
 # words of payload each
@@ -34,6 +35,7 @@ def call_loop(port: Port, run: Callable[[], object], t_ns: int) -> list[tuple[in
     return [(int(frame[0]), frame[2:].tobytes()[:frame[1]]) for frame in frames]
 
 
+@cache
 def load_loop(function: Callable[..., object], make_trial: Callable[[], Sequence[Any]]) -> StoredCode:
     """The machine code of a loop: some seconds on a new machine. `make_trial`: its arguments for a trial."""
     code = StoredCode(find_code_folder(function, IN_PYTHON), partial(compile_function, function, IN_PYTHON),

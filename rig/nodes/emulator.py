@@ -10,11 +10,11 @@ frames Python brings; one that has a bus of its own is in emulator_service.py.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import partial
 
 import numpy as np
 
-from plant import InputError, Model, StoredCode, load_model, require
+from plant import InputError, Model, load_model, require
 from rig.benches import RPDO, TPDO, VALUES_AT, Bench, CanopenNode, load_bench
 from rig.device import Abort, Device, EmcyCode, ErrorRegister, NmtState, SdoAbort
 from rig.network import COUNTERS, PLANT, SCENARIO, Frame, Port, Send, heartbeat
@@ -294,12 +294,6 @@ class Emulator(PlantNode):
         words[ec.SYNCED], words[ec.WAITING_DATA] = words[ec.CYCLE] - 1, drive
 
 
-@cache
-def load_service() -> StoredCode:
-    """The cycle of the node, for any plant: some seconds on a new machine."""
-    return load_loop(ec.serve_frame, make_trial)
-
-
 def make_trial() -> tuple[Port, ec.Memory]:
     """Arguments for one SYNC of the shipped bench."""
     bench = load_bench()
@@ -309,6 +303,9 @@ def make_trial() -> tuple[Port, ec.Memory]:
     memory.words[ec.PUSHED] = memory.words[ec.PERIOD] = 1
     ec.fill_noise(memory, np.random.default_rng(0))
     return make_port(), memory
+
+
+load_service = partial(load_loop, ec.serve_frame, make_trial)  # the cycle of the node, for any plant
 
 
 def list_unheard(bench: Bench) -> tuple[int, ...]:

@@ -19,6 +19,7 @@ from plant import ADVANCE_CALL, READ_CALL, Array, ForeignCall, Signals, find_dir
 from rig.benches import (
     FRAME_WORDS,
     FRAMES_AT,
+    LAST_SYNCHRONOUS,
     LENGTH,
     PAYLOAD,
     VALUES_AT,
@@ -29,6 +30,7 @@ from rig.benches import (
     make_layout,
     pack_frame,
     read_cycle_number,
+    to_integer,
     unpack_frame,
 )
 from rig.network import (
@@ -41,7 +43,6 @@ from rig.network import (
     receive_frame,
     send_frame,
     sleep_until,
-    to_integer,
 )
 from rig.nodes.scenario import Scenario
 from rig.sequences import DELAY, DOUBLE, DROP, SENT_NORMALLY, change_frame
@@ -92,7 +93,6 @@ _FRAMES = ("drive", "feedback", "valve_state", "sync", "plant")
 _ADDED, _HOLDS_READING, _HOLDS_VALUE = range(3)  # faults of a sensor
 
 DRIVE_MISSING, DRIVE_LATE, CURRENT_ZEROED = map(int, Flags)
-_LAST_SYNCHRONOUS = 240  # transmission types of PDOs (CiA 301, table 70)
 _TIMEOUT_CODE, _TIMEOUT_REGISTER = 0x8250, 0x11
 
 _call_advance, _call_read = ForeignCall(ADVANCE_CALL), ForeignCall(READ_CALL)
@@ -232,7 +232,7 @@ def _keep_drive(m: Memory, length: int, data: int) -> None:
     if words[SHORT]:
         _post_event(m, DRIVE_WHOLE)
         words[SHORT] = 0
-    if words[DRIVE_TYPE] <= _LAST_SYNCHRONOUS:
+    if words[DRIVE_TYPE] <= LAST_SYNCHRONOUS:
         words[WAITING], words[WAITING_DATA] = 1, data
     else:
         _read_drive(m, data)
@@ -500,7 +500,7 @@ def _send_due(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
 def _send_pdo(port: Port, m: Memory, what: int, k: int, t_ns: int) -> bool:
     """Send a synchronous TPDO of cycle k as a fault leaves it; whether it went out now."""
     words, at = m.words, TPDOS_AT + 4 * (what - FEEDBACK_FRAME)
-    if words[at + ID] < 0 or not 1 <= words[at + TYPE] <= _LAST_SYNCHRONOUS:
+    if words[at + ID] < 0 or not 1 <= words[at + TYPE] <= LAST_SYNCHRONOUS:
         return False
     code, argument = find_action(m, what, k)
     if code == DELAY:

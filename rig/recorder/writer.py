@@ -15,7 +15,6 @@ import zlib
 from array import array
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
 from datetime import UTC, datetime
 from functools import cache, partial
 from pathlib import Path
@@ -81,13 +80,8 @@ class CycleBlock(NamedTuple):
         row = {name: column[i].item() if isinstance(column, np.ndarray) else column
                for name, column in self.columns.items()}
         timing: Any = Timing
-        signals, timing = (kind(*map(row.get, _list_names(kind))) for kind in (self.record, timing))
+        signals, timing = (kind(*map(row.get, kind.__slots__)) for kind in (self.record, timing))
         return signals, timing
-
-
-@cache
-def _list_names(record: Any) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(record))
 
 
 def pack_block(block: CycleBlock, epoch_ns: int) -> tuple[bytes, dict[int, NDArray[np.uint64]]]:
@@ -135,7 +129,7 @@ def _make_template(frames: tuple[tuple[int, bool], ...], row: Any) -> tuple[np.d
     for record in (row, Timing):
         names.append(record.__name__)
         kinds.append(np.dtype(list_row_fields(record)))
-        parts.append(make_packer(record)(0, record(*[0] * len(fields(record)))))  # type: ignore[arg-type]
+        parts.append(make_packer(record)(0, record(*[0] * len(record.__slots__))))  # type: ignore[arg-type]
     return np.dtype(list(zip(names, kinds, strict=True))), b"".join(parts)
 
 

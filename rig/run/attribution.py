@@ -252,7 +252,7 @@ def _describe_plant(records: CycleRecords, late: LateCycles, span: slice) -> str
     if late.stalled[span].any():
         return f"by its own record the plant sent feedback {1e3 * records.plant_delay[span].max():.1f} ms after SYNC"
     if missing := int(np.isnan(records.feedback[span]).sum() or np.isnan(records.valve[span]).sum()):
-        return f"the plant sent no feedback for {missing} {'cycle' if missing == 1 else 'cycles'}"
+        return f"the plant sent no feedback for {count_nouns(missing, 'cycle')}"
     return f"the plant's feedback came {1e3 * float(np.nanmax(records.feedback[span], initial=0.0)):.1f} ms after SYNC"
 
 

@@ -10,13 +10,13 @@ value is what its receiver reads from its frame: rows and payloads are those of 
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plant import Array, ForeignCall, Loop, Model, Signals, StoredCode, compute_current
+from plant import Array, ForeignCall, Loop, Model, Signals, compute_current
 from rig.benches import (
     ALL_ROLES,
     LAST_CYCLE,
@@ -190,10 +190,7 @@ def make_trial() -> tuple[Port, Buffers, Memory]:
     return make_port(), b, plant
 
 
-@cache
-def load_code() -> StoredCode:
-    """The compiled cycles, for any plant: some seconds on a new machine."""
-    return load_loop(play_quiet_cycles, make_trial)
+load_code = partial(load_loop, play_quiet_cycles, make_trial)  # the compiled cycles, for any plant
 
 
 FRAMES = ("command", "sync", "feedback", "valve_state", "drive")  # that faults act on
@@ -202,8 +199,6 @@ Limits = Mapping[str, tuple[float, float]]  # of signals, SI
 
 class EmbeddedLoop(CycleLoop):
     """`CycleLoop` that plays quiet cycles together."""
-
-    plays_many = True
 
     def __init__(self, master: Master, bench: Bench, scenario: Scenario, faults: Schedule, log: CycleObserver,
                  guards: Limits) -> None:
@@ -221,7 +216,10 @@ class EmbeddedLoop(CycleLoop):
         self._answered = int(np.bitwise_or.reduce(self._layout.words[self._places + ROLES]))
 
     def play_many(self, phase: int, demands: Array, loads: Array, control: int) -> int:
-        """See `Loop`."""
+        """Run several cycles under one control word, as many of these as are possible at once; returns how many.
+
+        `demands` and `loads` in SI units. The rows of all but the last go to the log.
+        """
         emulator, firmware = self._embedded.nodes
         assert isinstance(emulator, Emulator)
         assert isinstance(firmware, Firmware)

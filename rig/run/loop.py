@@ -10,14 +10,14 @@ firing a burst. Either way the plant moves one period a SYNC, so a run that was 
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Collection, Mapping
-from functools import cache
+from functools import partial
 from math import nan
 from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from plant import Array, Model, StoredCode, signals as plant_signals
+from plant import Array, Model, signals as plant_signals
 from rig.benches import FD, RIG_OUTPUTS, Bench, Role, load_bench, packing
 from rig.network import PAYLOAD_IN, Frame, LinkWire, Master, Port, WallClock
 from rig.nodes import Emulator, Scenario, call_loop, emulator_cycle as ec, load_loop, load_plant, make_port
@@ -90,16 +90,11 @@ class CyclicValues:
         """The values that the rig gives in a cycle, SI; of fields of the device the physical value of its DBC."""
         phase = _PHASES[step.phase] if step.control else "safe"
         return [step.demand, step.load, float(step.control), self._mode,
-                *(find_phase_value(values, phase) for values in self._phases.values())]
+                *(float(values[phase]) for values in self._phases.values())]
 
     def list_safe(self, control: int) -> list[float]:
         """What replaces the given values in the safe state; NaN where nothing does."""
-        return [nan, nan, float(control), nan, *(find_phase_value(values, "safe") for values in self._phases.values())]
-
-
-def find_phase_value(values: Mapping[str, float], phase: str) -> float:
-    """The value of a field in a phase; in the safe state that of clean-up, if the bench file says nothing else."""
-    return float(values.get(phase, values.get("cleanup", 0.0)))
+        return [nan, nan, float(control), nan, *(float(values["safe"]) for values in self._phases.values())]
 
 
 class CycleObserver(Protocol):
@@ -124,7 +119,6 @@ class Loop(ABC):
     kind: str  # "soft" or "hard" real time
     scheduler = ""  # how the kernel schedules the thread of the cycle, if it has one of its own
     problem = ""  # why the plant cannot go on
-    plays_many = False  # whether `play_many` is worth a call
     _origin = 0  # ns: what the clock of the compiled code says when the run begins
     _idle_phase = 0
 
@@ -170,13 +164,6 @@ class Loop(ABC):
     @abstractmethod
     def cycle(self, step: CycleInput) -> None:
         """Run one cycle, or queue it; cycles that are complete go to the log."""
-
-    def play_many(self, phase: int, demands: Array, loads: Array, control: int) -> int:
-        """Run several cycles under one control word, as many of these as are possible at once; returns how many.
-
-        `demands` in m, `loads` in N. The rows of all but the last go to the log.
-        """
-        return 0
 
     @abstractmethod
     def finish(self) -> None:
@@ -272,12 +259,6 @@ def read_ring(ring: np.ndarray, first: int, last: int) -> list[list[Any]]:
     return entries
 
 
-@cache
-def load_parts() -> StoredCode:
-    """The parts of the cycle, for a loop in Python: some seconds on a new machine."""
-    return load_loop(cy.play_part, make_trial)
-
-
 def make_trial() -> tuple[Port, cy.Buffers, packing.Layout, ec.Memory]:
     """Arguments for a part of a cycle of the shipped bench: it sends its command."""
     bench = load_bench()
@@ -287,6 +268,9 @@ def make_trial() -> tuple[Port, cy.Buffers, packing.Layout, ec.Memory]:
     buffers.settings[:] = 0.0
     layout = packing.make_layout(bench.frames.list_of(Role.RIG), values.names, Role.RIG)
     return make_port(), buffers, layout, ec.make_memory(_AT_REST)
+
+
+load_parts = partial(load_loop, cy.play_part, make_trial)  # the parts of the cycle, for a loop in Python
 
 
 class CycleLoop(Loop):
@@ -413,9 +397,6 @@ class CycleLoop(Loop):
 
     # ------------------------------------------------------------------------------------ lockstep
 
-    def _is_answered(self) -> bool:
-        return cy.is_complete(self._words) and self._plant_left <= 0
-
     def _wait_for_answers(self, delay: int | None) -> None:
         """Let the answers come in; what is not sure to come is given the time of a cycle."""
         is_sure = self._are_sure and bool((self._layout.words[self._places + packing.LAST_CYCLE] >= 0).all())
@@ -423,7 +404,8 @@ class CycleLoop(Loop):
         if delay is None or not (is_sure or is_open):
             self._wire.run_until(self._wire.clock.now() + self._period)
         elif is_open:
-            self._wire.wait_for_answers(self._t_ns + delay, self._is_answered)
+            self._wire.wait_for_answers(self._t_ns + delay,
+                                        lambda: cy.is_complete(self._words) and self._plant_left <= 0)
             if self._drives_left > 0 and cy.is_complete(self._words):  # not every controller answers twice
                 self._wire.wait(lambda: self._drives_left <= 0, _SECOND_ANSWER)
 

@@ -30,7 +30,7 @@ from rig.run.bring_up import (
     open_loop,
     read_rows,
 )
-from rig.run.embedded_loop import MOST
+from rig.run.embedded_loop import MOST, EmbeddedLoop
 from rig.run.job import Job
 from rig.run.loop import AFTER, CycleInput, History
 from rig.run.participants import NodeProcesses, find_firmware_parameters
@@ -255,10 +255,10 @@ class Session:
                 if phase == CLEANUP and i == _SETTLING and not self._powered:
                     self._try_again()
                 control, before = self._choose_control_word(phase, i), loop.queued
-                i += self._play_many(phase, profile.command[i:section.stop], control) if loop.plays_many else 0
+                i += self._play_many(phase, profile.command[i:section.stop], control)
                 if loop.queued == before:
-                    load = self._find_load(loop.queued) if phase == MAIN else 0.0
-                    loop.cycle(CycleInput(phase, float(profile.command[i]), load, control))
+                    load = self._loads[before] if phase == MAIN and before < len(self._loads) else 0.0
+                    loop.cycle(CycleInput(phase, float(profile.command[i]), float(load), control))
                     i += 1
                 self._demand = float(profile.command[i - 1])
                 if loop.queued // 50 > before // 50:
@@ -269,13 +269,14 @@ class Session:
 
     def _play_many(self, phase: int, demands: Array, control: int) -> int:
         """Play several cycles at once, if the loop can and nothing is to be decided between them; returns how many."""
-        if self.safety.is_safe or not self._powered:
+        loop = self.stage.playing
+        if not isinstance(loop, EmbeddedLoop) or self.safety.is_safe or not self._powered:
             return 0
-        demands, k = demands[:MOST], self.stage.playing.queued
+        demands, k = demands[:MOST], loop.queued
         loads, scenario_loads = np.zeros(len(demands)), self._loads[k:k + len(demands)]
         if phase == MAIN:
             loads[:len(scenario_loads)] = scenario_loads
-        return self.stage.playing.play_many(phase, demands, loads, control)
+        return loop.play_many(phase, demands, loads, control)
 
     def _must_end(self) -> bool:
         """Before each cycle of set-up and main: whether something ends main."""
@@ -308,10 +309,6 @@ class Session:
             for cob_id, data in self.faults.foreign_frames(cycle):
                 self._master.send(cob_id, data)
         self._injected = k + 1
-
-    def _find_load(self, cycle: int) -> float:
-        """Force on the ram from the scenario in a cycle, N."""
-        return float(self._loads[cycle]) if cycle < len(self._loads) else 0.0
 
     def _choose_control_word(self, phase: int, i: int) -> int:
         """Control word of the phase's cycle `i`."""

@@ -146,7 +146,7 @@ class Bench:
 
         Args:
             sequence: a file, or the name of a shipped one (default: preflight).
-            command: in its place, a demand in m for each cycle of the bench, or a list of segments as tables.
+            command: in its place, a demand for each cycle of the bench, or a list of segments as tables.
             set: parameters of the model or of effects, SI: {"filter.clogging": 0.5}.
             model: a file, or the name of a shipped one; default: that of the bench, else that of the sequence.
             seed: of the noise.
@@ -183,7 +183,7 @@ def build_sequence(sequence: str | None, command: Command | None, rate: float = 
 
     Args:
         sequence: a file, or the name of a shipped sequence.
-        command: in its place, a demand in m for each cycle, or a list of segments as tables.
+        command: in its place, a demand for each cycle, or a list of segments as tables.
         rate: cycles a second.
         plant: that it tests.
         more: entries as tables that are added to those of the sequence, by key: faults, checks, guards, load.
@@ -216,7 +216,7 @@ def _make_table(command: Command, rate: float, column: str) -> tuple[dict[str, A
     files = {}
     if not any(isinstance(part, Mapping) for part in main):
         require(all(isinstance(value, Real) for value in main), "command", "",
-                "a demand in m for each cycle, all of them real numbers, or a list of segments as tables")
+                "a demand for each cycle, all of them real numbers, or a list of segments as tables")
         rows = "\n".join(f"{k / rate!r},{float(value)!r}" for k, value in enumerate(main))
         main = [{"name": "command", "kind": "csv", "file": _COMMAND_FILE}]
         files[_COMMAND_FILE] = f"t,{column}\n{rows}\n".encode()

@@ -58,7 +58,7 @@ def show_live(plan: LivePlan, log: Path, last_cpu_is_taken: bool, place: ViewerP
         send(b"\n")
 
     try:
-        cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        cpus = sorted(os.sched_getaffinity(0))
         if last_cpu_is_taken and len(cpus) > 1:
             with contextlib.suppress(OSError):  # it has ended
                 os.sched_setaffinity(process.pid, cpus[:-1])

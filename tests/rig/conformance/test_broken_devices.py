@@ -28,10 +28,10 @@ from rig_command import gone, nodes_on, refuse, rig, write_file
 
 from dbc import EDS
 from plant import RigError
+from rig.benches import INVALID
 from rig.conformance.run_cases import CASES, Outcome, Result, choose_cases, run_cases, write_junit
 from rig.conformance.target import CHAPTERS, DataSheet, Options, Target, Verdict
 from rig.device import Abort, NmtState, SdoAbort
-from rig.device.dictionary import INVALID
 from rig.network import CONTROLLER, EmbeddedWire, Send, VirtualClock
 from rig.network.bus import Done
 from rig.nodes import Firmware

@@ -114,7 +114,7 @@ def test_text_of_a_table_is_the_same_table() -> None:
     ({"sequence": None, "command": np.zeros(0)}, "command.csv"),
     ({"sequence": None, "command": np.array([0.0, np.nan])}, "a finite number"),
     ({"sequence": None, "command": [{"kind": "hold", "time": object()}]}, "not object"), ({"sequence": ""}, ".toml"),
-    *(({"command": command}, "command: expected a demand in m for each cycle, all of them real numbers")
+    *(({"command": command}, "command: expected a demand for each cycle, all of them real numbers")
       for command in (5, "abc", np.zeros((3, 3)), np.zeros(100) + 1j, np.array(0.0), [1e-3, None])),
     ({"command": STEP, "set": [1]}, "set: expected values by parameter"),
 ])
