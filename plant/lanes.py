@@ -240,7 +240,7 @@ class Lanes:
 
     def replay_in_turns(self, values: Array, current: Array, load: Array, position: Array | None = None,
                         anchor: float = 0.0, rows: int = TURN, slack: float = 0.0) -> Iterator[tuple[int, Array]]:
-        """The same replay, so many `rows` at a time: the first row of each piece, and its (m, k, 3).
+        """The same replay, so many `rows` at a time: the first row of each piece, and its (m, k, outputs).
 
         Memory does not grow with the recording. The numbers are those of `replay`, to the last bit.
 

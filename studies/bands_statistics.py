@@ -21,7 +21,7 @@ UNITS = (("healthy", {}, 1008, 2026), ("healthy, others", {}, 416, 99),
 
 def main() -> None:
     """Print the table of band verdicts and the table of precursors."""
-    com = load_sequence("preflight").main_profile().command
+    com = load_sequence("preflight").build_main_profile().command
     parts, bands, model = find_sections(com), load_default_bands(), load_model()
     for name, changes, count, seed in UNITS:
         x = simulate_units(model, com, np.zeros_like(com), changes, count, seed)

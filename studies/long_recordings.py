@@ -42,7 +42,7 @@ def measure_long_recordings(lengths: Sequence[float], seed: int = 0, progress: P
 
 def make_command(length: float, seed: int) -> Floats:
     """Command, (n,) m, of `length` s: the preflight's main phase first, then steps, sines, ramps and rest at random."""
-    rng, first = np.random.default_rng(seed), load_sequence("preflight").main_profile().command
+    rng, first = np.random.default_rng(seed), load_sequence("preflight").build_main_profile().command
     parts, rows = [first], len(first)
     while rows < 1000 * length:
         n = int(rng.integers(3000, 12000))

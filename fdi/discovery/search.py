@@ -765,9 +765,9 @@ LINES = 4  # tried
 SCAN_STRIDE = 5  # every so many samples, for the linear shift alone
 
 
-# effects that other unknowns can make up for, all but a little: directions of level.FLAT by which these then go with
-# 1 - value. A clogged filter weakens what pushes the spool, so a fit without it has found too much friction and too
-# little flow; friction cannot give way linearly, a hundred stops of the spool would move
+# effects that other unknowns can make up for, all but a little: directions of unidentifiable.FLAT by which these then
+# go with 1 - value. A clogged filter weakens what pushes the spool, so a fit without it has found too much friction and
+# too little flow; friction cannot give way linearly, a hundred stops of the spool would move
 GOES_WITH: Mapping[str, tuple[int, ...]] = {"filter_clogging": (0, 1)}
 
 

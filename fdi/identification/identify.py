@@ -296,7 +296,7 @@ STEPS = 20  # solver steps a cycle
 
 
 class Experiment(NamedTuple):
-    """A run that could be made: its name, what to do, its command, (n,) m, by the model, and whether under a load."""
+    """A run that could be made: its name, what to do, its command, (n,) SI, by the model, and whether under a load."""
 
     name: str
     what: str

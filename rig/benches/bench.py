@@ -48,7 +48,7 @@ class Kind(IntEnum):
     FLOAT = 2  # IEEE 754, 32 or 64 bits
 
 
-class Guard(IntEnum):
+class Protection(IntEnum):
     """What a protected field holds: the sender computes it and the receiver checks it."""
 
     NONE = 0
@@ -68,7 +68,7 @@ class Field:
     count: Fraction = Fraction(1)  # what a count is worth, SI
     offset: Fraction = Fraction(0)  # SI
     fixed: int | None = None  # always these counts: selector of a multiplexed frame, or filling
-    guard: Guard = Guard.NONE
+    protection: Protection = Protection.NONE
     wrap: int | None = None  # of a counter: how many values it has; None: all that its bits hold
     checksum: str = ""  # of a checksum: name in checksums.py, or FILE.py:FUNCTION
     data_id: int = 0  # of AUTOSAR's profile 1
@@ -286,15 +286,15 @@ def pack(spec: FrameSpec, values: Mapping[str, float], counter: int = 0) -> byte
     for each in spec.fields:
         if each.fixed is not None:
             data = insert_bits(each, data, each.fixed)
-        elif each.guard is Guard.COUNTER:
+        elif each.protection is Protection.COUNTER:
             counter %= each.modulus
             data = insert_bits(each, data, counter)
         elif each.name == "cycle":
             data = insert_bits(each, data, int(values.get("cycle", 0)))
-        elif each.guard is Guard.NONE:
+        elif each.protection is Protection.NONE:
             data = insert_bits(each, data, each.encode(values.get(each.name, 0.0)))
     for each in spec.fields:
-        if each.guard is Guard.CHECKSUM:  # over all else
+        if each.protection is Protection.CHECKSUM:  # over all else
             data = insert_bits(each, data, compute_checksum(each, data, counter))
     return data
 

@@ -42,8 +42,8 @@ from rig.benches.bench import (
     CanopenNode,
     FrameMap,
     FrameSpec,
-    Guard,
     Profile,
+    Protection,
     Role,
     SignalObject,
     decode_device_text,
@@ -372,10 +372,10 @@ def _add_states(reader: _Reader, uses: dict[str, Use], keys: ControllerKeys, pla
                                                       for key, value in entry.items()}, entry_place)
         entry_place.at("data_id").require(protection.kind != "counter" or protection.data_id is None,
                                           "a checksum with it")
-        use = Use(place=entry_place, is_received=None, guard=Guard.COUNTER)
+        use = Use(place=entry_place, is_received=None, protection=Protection.COUNTER)
         if protection.kind != "counter":
             checksum = reader.find_checksum(protection.kind, entry_place)
-            use = _set_data_id(replace(use, guard=Guard.CHECKSUM, checksum=checksum), protection.data_id)
+            use = _set_data_id(replace(use, protection=Protection.CHECKSUM, checksum=checksum), protection.data_id)
         _add_use(uses, name, use, is_canopen=is_canopen)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from fdi.report import Cell, Column, Report, Section, Table, tabulate
-from rig.benches.bench import EXTENDED, FD, SWITCHED, Bench, FrameSpec, Guard, Role, describe_identifier
+from rig.benches.bench import EXTENDED, FD, SWITCHED, Bench, FrameSpec, Protection, Role, describe_identifier
 
 HEARTBEAT = 0.1  # s, of each node of the rig
 
@@ -84,9 +84,9 @@ def list_content(spec: FrameSpec) -> tuple[str, ...]:
 
     A selector has its value, a protected field what it is.
     """
-    words = {Guard.NONE: "", Guard.COUNTER: " (counter)"}
+    words = {Protection.NONE: "", Protection.COUNTER: " (counter)"}
     return tuple(f"{each.name} = {each.fixed}" if each.fixed is not None else
-                 each.name + words.get(each.guard, f" ({each.checksum.partition('#')[0]})")
+                 each.name + words.get(each.protection, f" ({each.checksum.partition('#')[0]})")
                  for each in spec.fields if each.name)
 
 

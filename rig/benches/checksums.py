@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from plant import InputError, require, run_file
-from rig.benches.bench import Field, Guard, insert_bits
+from rig.benches.bench import Field, Protection, insert_bits
 
 
 @cache
@@ -69,7 +69,7 @@ def compute_checksum(each: Field, data: bytes, counter: int) -> int:
     """The checksum that belongs into a field of this frame; what `data` has there does not matter.
 
     Args:
-        each: the field, of guard CHECKSUM.
+        each: the field, which is protected by a CHECKSUM.
         data: the whole frame.
         counter: the frame's alive counter, or how many of these frames were sent before: both choose the same data ID.
 
@@ -102,5 +102,6 @@ def load_checksum(name: str, source: bytes, function: str) -> str:
         require(callable(getattr(module, function, None)), name, function,
                 "a function (data: bytes, counter: int) -> int")
         USERS_CHECKSUMS[checksum] = getattr(module, function)
-        compute_checksum(Field(name="", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=checksum), bytes(8), 0)
+        compute_checksum(Field(name="", lowest=0, length=8, protection=Protection.CHECKSUM, checksum=checksum),
+                         bytes(8), 0)
     return checksum

@@ -10,7 +10,7 @@ from fractions import Fraction
 from typing import Any
 
 from plant import InputError, Place, fit_unit, list_choices
-from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role, encode_float, list_bits
+from rig.benches.bench import Field, FrameSpec, Kind, Protection, Role, encode_float, list_bits
 
 PHASES = ("setup", "main", "cleanup", "safe")
 _PLAIN = {"": Fraction(1), "-": Fraction(1), "1": Fraction(1), "%": Fraction(1, 100)}  # units of a plain number
@@ -30,7 +30,7 @@ class Use:
     count: Fraction | None = None  # what a count is worth, if the file says so
     offset: Fraction | None = None
     values: Mapping[str, float | str] = field(default_factory=dict)  # by phase; a state that is awaited: in "main"
-    guard: Guard = Guard.NONE
+    protection: Protection = Protection.NONE
     checksum: str = ""
     data_id: int = 0
     data_ids: tuple[int, ...] = ()
@@ -89,7 +89,7 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
             have, or whose counts have no known worth; a second counter or checksum.
     """
     owners: dict[int, str] = {}
-    guards: dict[Guard, str] = {}
+    protections: dict[Protection, str] = {}
     fields = []
     for slot in sorted(frame.slots, key=lambda slot: slot.name not in uses and not slot.is_selector):
         use, length = uses.get(slot.name), slot.bits.length
@@ -106,12 +106,13 @@ def build_fields(frame: DeviceFrame, uses: Mapping[str, Use]) -> tuple[Field, ..
         if is_inside and not other:
             owners |= dict.fromkeys(places, slot.name)
             fields.append(_build_field(slot, use))
-        if use is not None and use.guard is not Guard.NONE:
-            use.place.require(use.guard not in guards, f"one {use.guard.name.lower()} in a frame; "
-                              f"{frame.spec.name} has {guards.get(use.guard)}")
-            guards[use.guard] = slot.name
+        if use is not None and use.protection is not Protection.NONE:
+            use.place.require(use.protection not in protections, f"one {use.protection.name.lower()} in a frame; "
+                              f"{frame.spec.name} has {protections.get(use.protection)}")
+            protections[use.protection] = slot.name
     if any(each.checksum == "e2e_profile_1" for each in fields):  # its counter never is 15 (AUTOSAR PRS E2E)
-        fields = [replace(each, wrap=min(each.modulus, 15)) if each.guard is Guard.COUNTER else each for each in fields]
+        fields = [replace(each, wrap=min(each.modulus, 15)) if each.protection is Protection.COUNTER else each
+                  for each in fields]
     return tuple(sorted(fields, key=lambda each: min(list_bits(each))))
 
 
@@ -120,17 +121,17 @@ def _build_field(slot: Slot, use: Use | None) -> Field:
         start = encode_float(slot.start, slot.bits.length) if slot.bits.kind is Kind.FLOAT else int(slot.start)
         return replace(slot.bits, name=slot.name if slot.is_selector else "", wrap=None,
                        fixed=start & (1 << slot.bits.length) - 1)
-    if use.guard is not Guard.NONE:
+    if use.protection is not Protection.NONE:
         use.place.require(slot.bits.kind is not Kind.FLOAT,
                           f"a whole number to protect the frame with; {slot.name} is floating point")
-        if use.guard is Guard.COUNTER:
+        if use.protection is Protection.COUNTER:
             use.place.require(slot.bits.length <= 32,
                               f"a counter of at most 32 bits; {slot.name} has {slot.bits.length}")
-            return replace(slot.bits, name=slot.name, guard=use.guard)
+            return replace(slot.bits, name=slot.name, protection=use.protection)
         use.place.require("#" in use.checksum or (slot.bits.length == 8 and slot.bits.lowest % 8 == 0),
                           f"a byte for {use.checksum}; {slot.name} has {slot.bits.length} bits from bit "
                           f"{slot.bits.lowest} on")
-        return replace(slot.bits, name=slot.name, guard=use.guard, wrap=None, checksum=use.checksum,
+        return replace(slot.bits, name=slot.name, protection=use.protection, wrap=None, checksum=use.checksum,
                        data_id=use.data_id, data_ids=use.data_ids)
     if not use.signal:
         return replace(slot.bits, name=slot.name, wrap=None)

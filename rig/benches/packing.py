@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plant import ForeignCall, InputError, compile_function, find_function_address, keep_apart, raise_unbound
-from rig.benches.bench import Field, FrameSpec, Guard, Kind, Role
+from rig.benches.bench import Field, FrameSpec, Kind, Protection, Role
 from rig.benches.checksums import CHECKSUMS, USERS_CHECKSUMS, add_byte
 
 # Words of the layout: a scratch word, the payload, then counts and places of the tables
@@ -299,7 +299,7 @@ def _find_rule(field: Field) -> int:
         return _CONSTANT
     if field.name == "cycle":
         return _CYCLE
-    return {Guard.NONE: _VALUE, Guard.COUNTER: _COUNTER, Guard.CHECKSUM: _CHECKSUM}[field.guard]
+    return {Protection.NONE: _VALUE, Protection.COUNTER: _COUNTER, Protection.CHECKSUM: _CHECKSUM}[field.protection]
 
 
 def _fill_field(m: Layout, at: int, field: Field, rule: int, channel: int) -> None:

@@ -686,7 +686,7 @@ def make_memory(scenario: Scenario, advance: int = 0, read: int = 0, frames: Seq
     not direct (`find_direct_readings`), `read_flat_sensors`. `frames`: drive, feedback and valve state, for a plant
     that is a node of its own.
     """
-    model, load, schedule = scenario.model, scenario.load(), scenario.make_schedule()
+    model, load, schedule = scenario.model, scenario.list_loads(), scenario.make_schedule()
     names = model.list_names()
     parameters: list[tuple[int, ...]] = []
     signals: list[tuple[int, ...]] = []

@@ -36,7 +36,7 @@ class Scenario(NamedTuple):
         effects = {fault.parameter.partition(".")[0] for fault in plan.faults if isinstance(fault, Parameter)}
         return cls(model.with_effects(effects), plan, tuple(counts), seed)
 
-    def load(self) -> list[float]:
+    def list_loads(self) -> list[float]:
         """The load, SI, one a cycle; none after the last."""
         loads: list[float] = (find_load_count(self.model) * np.array(self.load_counts)).tolist()
         return loads

@@ -92,7 +92,7 @@ class Job(RunSettings):
         object.__setattr__(self, "sequence", self.sequence.at_rate(self.bench.rate))
         object.__setattr__(self, "model", self.model.replace({"controller.period": self.period_ns / 1e9}))
         self._require_range()
-        self.model.require_acting_load(self.sequence.load_profile(), self.sequence.name)
+        self.model.require_acting_load(self.sequence.build_load_profile(), self.sequence.name)
 
     def _require_range(self) -> None:
         """Refuse a demand that its frame cannot hold: the frame would carry another one than the checks judge."""
@@ -119,7 +119,7 @@ class Job(RunSettings):
     def scenario(self) -> Scenario:
         """The plant's scenario; computed once, because a long test has many cycles."""
         sequence = self.sequence
-        return Scenario.build(self.model, sequence.plan(self.seed), sequence.load_profile(), self.seed)
+        return Scenario.build(self.model, sequence.plan(self.seed), sequence.build_load_profile(), self.seed)
 
     def build_attachments(self) -> dict[str, tuple[str, bytes]]:
         """What a log carries so that the run can be repeated: name to (media type, bytes)."""

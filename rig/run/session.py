@@ -126,10 +126,11 @@ class Session:
     def __init__(self, job: Job, wire: Wire, processes: NodeProcesses, recorder: Recorder, progress: Progress,
                  stop: Callable[[], bool]) -> None:
         self.job, self._progress, self._stop = job, progress, stop
-        self._setup, self._main = job.sequence.setup_profile(), job.sequence.main_profile()  # now, not between cycles
+        # now, not between cycles
+        self._setup, self._main = job.sequence.build_setup_profile(), job.sequence.build_main_profile()
         self.scenario = job.scenario
         plan = self.scenario.plan
-        self._loads = np.array(self.scenario.load())
+        self._loads = np.array(self.scenario.list_loads())
         self.faults = self.scenario.make_schedule()
         self._is_embedded = isinstance(wire, EmbeddedWire)
         self.stage = Stage(wire.clock, plan.start, plan.rate)
@@ -334,7 +335,7 @@ class Session:
             self._powered = self._may_power = False
             rate = self.job.bench.rate
             return build_profile((Hold(time=max(1, round(0.1 * rate)) / rate),), self._demand, rate)
-        return self.job.sequence.cleanup_profile(self._demand)
+        return self.job.sequence.build_cleanup_profile(self._demand)
 
     def _restore_nodes(self) -> bool:
         """Try to set all nodes to OPERATIONAL without errors; return whether clean-up may use current."""

@@ -358,7 +358,7 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
             yield _make_result(name, "drive", value, "%", high=100 * largest_share, detail=f"{count} of {cycles}")
         else:
             yield SkippedCheck(name, "the controller's frames do not carry the number of the cycle")
-    if any(each.guard for spec in specs for each in spec.fields):
+    if any(each.protection for spec in specs for each in spec.fields):
         yield _make_result("wrong checksums and alive counters", "drive", record.unsound, "1",
                            high=largest_share * cycles)
 

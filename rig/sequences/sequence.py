@@ -154,32 +154,32 @@ class Sequence:
         """Length of main, s."""
         return sum(segment.duration for segment in self.main)
 
-    def setup_profile(self) -> Profile:
+    def build_setup_profile(self) -> Profile:
         """The command before main, from 0."""
         return build_profile(self.setup, rate=self.rate)
 
-    def main_profile(self) -> Profile:
+    def build_main_profile(self) -> Profile:
         """The command that is judged, from where set-up ended."""
-        return build_profile(self.main, self.setup_profile().end, self.rate)
+        return build_profile(self.main, self.build_setup_profile().end, self.rate)
 
-    def cleanup_profile(self, start: float) -> Profile:
+    def build_cleanup_profile(self, start: float) -> Profile:
         """The command after main, or after it was broken off at the demand `start`, SI."""
         return build_profile(self.cleanup, start, self.rate)
 
     def split_phase(self, phase: str) -> list[Array]:
         """The values of each segment of a phase, SI; of the last one also the value that it ends at."""
         profiles: dict[str, Callable[[], Profile]] = {
-            "setup": self.setup_profile, "main": self.main_profile,
-            "cleanup": lambda: self.cleanup_profile(self.main_profile().end),
+            "setup": self.build_setup_profile, "main": self.build_main_profile,
+            "cleanup": lambda: self.build_cleanup_profile(self.build_main_profile().end),
             "load": lambda: build_profile(self.load, rate=self.rate)}
         values, sections, end = profiles[phase]()
         return [np.append(values, end)[each.start:each.stop + (each is sections[-1])] for each in sections]
 
     def sections(self) -> dict[str, slice]:
         """Rows of main by section name, as checks see them."""
-        return {section.name: slice(section.start, section.stop) for section in self.main_profile().sections}
+        return {section.name: slice(section.start, section.stop) for section in self.build_main_profile().sections}
 
-    def load_profile(self) -> Array:
+    def build_load_profile(self) -> Array:
         """The load, SI, for every cycle of main."""
         force, _, end = build_profile(self.load, rate=self.rate)
         cycles = round(self.duration * self.rate)
@@ -507,4 +507,4 @@ def load_nominal_test(kind: Plant, period: float) -> tuple[Array, Array | None, 
 def _sample_preflight(rate: float) -> tuple[Array, Array]:
     """Demand, m, and load, N, `rate` values a second. Raises InputError if its segments are not whole cycles."""
     sequence = load_sequence("preflight", rate)
-    return sequence.main_profile().command, sequence.load_profile()
+    return sequence.build_main_profile().command, sequence.build_load_profile()

@@ -130,12 +130,12 @@ def make_dry_run(job: Job) -> DryRun:
     """
     faults = plan_faults(job)
     sequence, model = job.sequence, job.model
-    setup, main = sequence.setup_profile(), sequence.main_profile()
-    phases = {"setup": setup, "main": main, "cleanup": sequence.cleanup_profile(main.end)}
+    setup, main = sequence.build_setup_profile(), sequence.build_main_profile()
+    phases = {"setup": setup, "main": main, "cleanup": sequence.build_cleanup_profile(main.end)}
     command = np.concatenate([profile.command for profile in phases.values()])
     first, last = len(setup.command), len(setup.command) + len(main.command)
     load = np.zeros(len(command))
-    load[first:last] = sequence.load_profile()
+    load[first:last] = sequence.build_load_profile()
     rate = sequence.rate
     t = (np.arange(len(command)) - first) / rate
     prediction = simulate(model, command, load, job.seed)

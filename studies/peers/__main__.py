@@ -17,7 +17,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def measure() -> Report:
     """Race both tasks over the preflight command."""
-    command = load_sequence("preflight").main_profile().command
+    command = load_sequence("preflight").build_main_profile().command
     many, grid = compare_many_runs(command, report_progress), compare_grid_runs(command, report_progress)
     return Report(
         command="peers", title="peers", sentence="Speed beside other libraries at the same task.",

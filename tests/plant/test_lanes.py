@@ -266,7 +266,7 @@ def test_the_transducer_moves_along_where_the_ram_is_pulled() -> None:
     assert shifts == pytest.approx((1e-5, 1e-5))
 
 
-PREFLIGHT = load_sequence("preflight").main_profile().command
+PREFLIGHT = load_sequence("preflight").build_main_profile().command
 STEP = np.r_[np.zeros(20), np.full(300, 1e-3)]
 
 

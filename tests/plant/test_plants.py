@@ -202,7 +202,7 @@ plant.declare.base_effect("wheel", Wheel, "damping", law="B", starts=(0.3,))
 class DryFriction(""", id="effect named like a group")])
 def test_an_unusual_plant_file_is_taken(old: str, new: str, tmp_path: Path) -> None:
     model = load_model(write_file(tmp_path / "unusual.py", TEXT.replace(old, new))).replace({"wheel.inertia": 0.06})
-    com = load_sequence("preflight", 1.0 / model["controller.period"], model.plant).main_profile().command
+    com = load_sequence("preflight", 1.0 / model["controller.period"], model.plant).build_main_profile().command
     assert old in TEXT and np.isfinite(simulate(model, com[:50], steps=4, fast=False)).all()
 
 

@@ -4,6 +4,6 @@ from plant import Model
 from rig.bench.benchmarks import FRICTIONLESS, QUIET
 from rig.sequences import load_sequence
 
-PREFLIGHT = load_sequence("preflight").main_profile().command
+PREFLIGHT = load_sequence("preflight").build_main_profile().command
 SILENT = Model().replace(QUIET)
 SMOOTH = SILENT.replace(FRICTIONLESS)  # no dry friction

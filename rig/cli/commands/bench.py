@@ -35,7 +35,7 @@ def run_command(args: argparse.Namespace) -> int:
 
 def measure_plant(args: argparse.Namespace, progress: Progress) -> Report:
     """The speed of the plant; with --accuracy also the error of its step."""
-    command = load_sequence("preflight").main_profile().command
+    command = load_sequence("preflight").build_main_profile().command
     figures = run_benchmarks(command, progress)
     if args.accuracy:
         progress("accuracy of the step", 0.0)

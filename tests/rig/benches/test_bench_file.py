@@ -11,7 +11,7 @@ from refusals import catch_refusal
 
 from dbc import EDS
 from rig.benches import Role, load_bench, load_bench_from_files, pack
-from rig.benches.bench import Guard, Kind
+from rig.benches.bench import Kind, Protection
 from rig.benches.bench_file import list_benches
 
 EXAMPLES = sorted(ROOT.glob("examples/*/bench.toml"))
@@ -101,7 +101,8 @@ def test_an_ecu_on_plain_can(tmp_path: Path) -> None:
     assert bench.phases == {"Demand.Enable": {"setup": 0, "main": 1, "cleanup": 0, "safe": 0}}
     assert (bench.ready, bench.timeout_ns, bench.nodes) == ({"Drive.State": 3}, 20_000_000, {})
     assert [spec.every for spec in bench.frames.frames] == [2, 2, 2]
-    assert [(each.name, each.wrap) for each in demand.fields if each.guard is Guard.COUNTER] == [("Demand.Counter", 15)]
+    assert [(each.name, each.wrap) for each in demand.fields if each.protection is Protection.COUNTER] == [
+        ("Demand.Counter", 15)]
     data = pack(demand, {"position_demand": 0.001, "Demand.Enable": 1.0}, counter=16)
     assert data[1:] == bytes.fromhex("11" "00" "0003e8" "0000")
     assert pack(feedback, {"ram_position": 0.0}) == (1000).to_bytes(4, "little")

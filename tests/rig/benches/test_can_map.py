@@ -34,7 +34,7 @@ from rig.benches import (
     unpack,
     unpack_frame,
 )
-from rig.benches.bench import Field, Guard, Kind, extract_bits
+from rig.benches.bench import Field, Kind, Protection, extract_bits
 from rig.benches.checksums import compute_checksum, compute_crc8, load_checksum
 
 INPUTS = {"position_demand": ("mm", 1e-3), "ram_position": ("m", 1.0), "load_pressure": ("bar", 1e5),
@@ -281,7 +281,7 @@ FFFFFFFF 74 6C"""
 
 
 def make_field(checksum: str, **options: object) -> Field:
-    return Field(name="", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=checksum, **options)  # type: ignore[arg-type]
+    return Field(name="", lowest=0, length=8, protection=Protection.CHECKSUM, checksum=checksum, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("name", "polynomial", "column"), [("crc8_sae_j1850", 0x1D, 1), ("crc8_h2f", 0x2F, 2)])

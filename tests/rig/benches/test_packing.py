@@ -1,4 +1,4 @@
-"""Compiled packing: what guards a frame, and which frame it is. (Its bits: test_can_map.py.)"""
+"""Compiled packing: what protections a frame, and which frame it is. (Its bits: test_can_map.py.)"""
 
 
 import numpy as np
@@ -21,7 +21,7 @@ from rig.benches import (
     pack_frame,
     unpack_frame,
 )
-from rig.benches.bench import Field, Guard
+from rig.benches.bench import Field, Protection
 from rig.benches.packing import REPEATED, WRONG_CHECKSUM
 
 
@@ -47,8 +47,8 @@ def test_alive_counter_and_checksum(checksum: str, data_id: int, data_ids: tuple
     """The sender computes both; the receiver takes no frame with a wrong checksum and none twice."""
     write, read, _ = functions
     fields = (Field(name="value", lowest=16, length=16),
-              Field(name="count", lowest=8, length=4, guard=Guard.COUNTER, wrap=15),
-              Field(name="crc", lowest=0, length=8, guard=Guard.CHECKSUM, checksum=checksum, data_id=data_id,
+              Field(name="count", lowest=8, length=4, protection=Protection.COUNTER, wrap=15),
+              Field(name="crc", lowest=0, length=8, protection=Protection.CHECKSUM, checksum=checksum, data_id=data_id,
                     data_ids=data_ids))
     spec = FrameSpec(name="frame", identifier=1, length=8, sender=Role.RIG, fields=fields)
     sender, receiver = make_layout([spec], ["value"], Role.RIG), make_layout([spec], ["value"], Role.CONTROLLER)
@@ -70,7 +70,7 @@ def test_pages_of_a_message_have_one_alive_counter(functions: tuple) -> None:
     """Of a multiplexed message the sender counts all frames, and the receiver takes the next one of any page."""
     pages = [FrameSpec(name=f"page {page}", identifier=5, length=2, sender=Role.RIG, fields=(
         Field(name="selector", lowest=0, length=4, fixed=page),
-        Field(name="count", lowest=8, length=4, guard=Guard.COUNTER))) for page in (0, 1)]
+        Field(name="count", lowest=8, length=4, protection=Protection.COUNTER))) for page in (0, 1)]
     sender, receiver = make_layout(pages, [], Role.RIG), make_layout(pages, [], Role.CONTROLLER)
     for number in range(40):
         functions[0](sender, list_frame_places(sender)[number % 2], 0)

@@ -61,7 +61,7 @@ def test_a_run_is_that_of_the_simulation_at_any_cycle(cycle: str, tmp_path: Path
     trace, period = Trace.read(tmp_path / "a"), float(cycle) / 1e3
     assert trace.period == period and len(trace) == round(0.35 / period)
     sequence = parse_sequence(SHORT, "short.toml", lambda name: b"", 1 / period)
-    command = np.concatenate((sequence.setup_profile().command, sequence.main_profile().command))
+    command = np.concatenate((sequence.build_setup_profile().command, sequence.build_main_profile().command))
     model = Model().replace({"controller.period": period, "controller.proportional_gain": GAIN})
     assert float(np.abs(trace.xj - simulate(model, command).xj[round(0.05 / period):]).max()) < 20e-6
     result = rig("run", "--from", tmp_path / "a" / "trace.mcap", "--quiet", "--out", tmp_path / "b")

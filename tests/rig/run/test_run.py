@@ -60,7 +60,7 @@ def test_the_bench_is_the_simulation(tmp_path: Path) -> None:
     """Without friction and noise both are smooth, and what is left between them is the bus's resolution."""
     one = job(set_=SMOOTH | QUIET, seed=1)
     play(one, tmp_path)
-    row, trace = simulate(one.model, one.sequence.main_profile().command), Trace.read(tmp_path)
+    row, trace = simulate(one.model, one.sequence.build_main_profile().command), Trace.read(tmp_path)
     for name, counts in (("xj", 2 * codec.POSITION), ("xs", 400 * codec.SPOOL), ("p12", 1e4)):
         assert np.abs(trace.column(name) - getattr(row, name)).max() < counts, name
 

@@ -61,7 +61,7 @@ def test_profile_check_and_steps_run_from_a_log_too(tmp_path: Path) -> None:
     assert (check["unit"], check["requirement"], check["kind"]) == ("um", ["R-1"], "python")
     assert (tmp_path / "a" / "notes.txt").read_text() == "begin ''\nend 'PASS'\n"
     assert result.err == "begin\nend\n"  # what the code prints does not spoil the JSON answer
-    profile = load_sequence(tmp_path / "own.toml").main_profile()
+    profile = load_sequence(tmp_path / "own.toml").build_main_profile()
     assert profile.command[150] == pytest.approx(1e-3 * 0.25) and profile.sections[1].name == "own"
 
     (tmp_path / "own.py").unlink()  # the log has it
@@ -138,7 +138,7 @@ def test_the_step_after_runs_even_if_the_run_cannot(tmp_path: Path) -> None:
 def test_a_profile_is_computed_once_for_each_start(tmp_path: Path) -> None:
     """A function that is not the same twice does not make a run whose log contradicts itself."""
     sequence = load_sequence(write(tmp_path, code=CODE.replace("start + (to", "start + np.random.rand() * (to")))
-    assert np.array_equal(sequence.main_profile().command, sequence.main_profile().command)
+    assert np.array_equal(sequence.build_main_profile().command, sequence.build_main_profile().command)
 
 
 def test_a_file_of_a_bundle_that_is_missing_is_named(tmp_path: Path) -> None:

@@ -85,11 +85,11 @@ def test_a_full_sequence_says_what_the_file_says() -> None:
     s = parse(FULL)
     assert (s.title, s.name, s.duration, s.ends) == ("All of it", "mine.toml", 1.003, "completed")
     assert s.model.overrides == {"spool.static_friction": 35.0, "null_bias.current": 1e-4}
-    command, force = s.main_profile().command, s.load_profile()
+    command, force = s.build_main_profile().command, s.build_load_profile()
     # main goes on where set-up ended
     assert command[[0, 500, 1000, 1001, 1002]].tolist() == [1e-3, 2e-3, 0.002, 0.001, 0.0]
     assert s.sections() == {"hold_1": slice(0, 500), "up": slice(500, 1000), "taped": slice(1000, 1003)}
-    assert s.cleanup_profile(5e-3).command[0] == 5e-3
+    assert s.build_cleanup_profile(5e-3).command[0] == 5e-3
     assert len(force) == 1003 and force[50] == 500.0 and force[100] == 1000.0 and (force[200:] == 500.0).all()
     plan = s.plan(seed=3)
     assert (plan.start, plan.stop, plan.seed) == (200, 1203, 3)
@@ -313,13 +313,13 @@ def test_a_shipped_sequence_is_whole(name: str) -> None:
     assert s.title and s.description and s.checks and s.cleanup
     assert Sequence.from_bundle(s.bundle()) == s
     assert all(line == line.rstrip() for line in s.source.splitlines())
-    assert s.cleanup_profile(3e-3).end == 0.0
+    assert s.build_cleanup_profile(3e-3).end == 0.0
 
 
 def judge_preflight(changes: dict[str, float], seed: int) -> list[CheckResult]:
     """The preflight on the model alone, without a bus."""
     s = load_sequence("preflight")
-    setup, main = s.setup_profile().command, s.main_profile().command
+    setup, main = s.build_setup_profile().command, s.build_main_profile().command
     run = simulate(load_model("eha").replace(changes), np.concatenate((setup, main)), seed=seed)
     rows = {name: column[len(setup):] for name, column in run._asdict().items()}
     return evaluate_checks(s.checks, SimpleNamespace(**{**rows, "t": run.t[:len(main)]}), s.sections())
@@ -446,8 +446,8 @@ def test_a_fault_that_contradicts_the_model_of_the_run_is_refused_before_it() ->
     """The sequence is sound on the actuator it names; --set has made another of it."""
     s = parse(HEAD + 'faults = [{ kind = "parameter", parameter = "jack.static_friction", value = 600, start = 0 }]')
     other = load_model("eha").replace({"jack.dynamic_friction": 700.0})
-    Scenario.build(load_model("eha"), s.plan(0), s.load_profile(), 0)
-    line = catch_refusal(Scenario.build, other, s.plan(0), s.load_profile(), 0)
+    Scenario.build(load_model("eha"), s.plan(0), s.build_load_profile(), 0)
+    line = catch_refusal(Scenario.build, other, s.plan(0), s.build_load_profile(), 0)
     assert "parameter jack.static_friction: expected jack.dynamic_friction at most " in line
 
 

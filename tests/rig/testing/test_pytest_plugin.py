@@ -105,7 +105,7 @@ def test_text_of_a_table_is_the_same_table() -> None:
     assert read == {**table, "list": [{"to": 0.1, "k": [1, 2]}],
                     "map": {"filter.clogging": 0.5, "spaced name": [1.0, 2.0]}}
     command = np.random.default_rng(0).normal(size=50) * 1e-4
-    assert np.array_equal(build_sequence(None, command).main_profile().command, command)
+    assert np.array_equal(build_sequence(None, command).build_main_profile().command, command)
 
 
 @pytest.mark.parametrize(("arguments", "line"), [
