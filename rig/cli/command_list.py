@@ -302,7 +302,7 @@ COMMANDS = {
                      "frames of --bench)"),
          option("--guess", action="store_true",
                 help="write a first map (FILE.map.toml, or --out), with its reasons"),
-         option("--force", action="store_true", help="let --guess replace a map that exists"),
+         option("--force", action="store_true", help="replace the trace, or the map of --guess, if there is one"),
          option("--dbc", metavar="FILE", help="with --map or --guess: DBC that decodes the raw frames (default: the "
                                               "shipped eha.dbc)"),
          BENCH, option("--model", metavar="FILE|NAME",

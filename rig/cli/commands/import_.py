@@ -20,7 +20,6 @@ def run_command(args: argparse.Namespace) -> int:
     source = Path(args.file)
     require(source.exists(), source, "", "a file that can be read; it does not exist")
     require(not (args.guess and args.map), "--guess", args.map, "--guess or --map, not both")
-    require(args.guess or not args.force, "--force", "", "--guess, whose map it lets replace another")
     require(not args.bench or (source.suffix in RAW_SUFFIXES and not args.map and not args.guess),
             "--bench", args.bench, "a CAN log without --map or --guess")
     require(not args.dbc or source.suffix in RAW_SUFFIXES, "--dbc", args.dbc,
@@ -29,10 +28,10 @@ def run_command(args: argparse.Namespace) -> int:
             "--map or --guess with it; without them the frames are those of --bench")
     suffix = ".map.toml" if args.guess else ".mcap"
     out = source.with_name(name_after(source, suffix)) if args.out is None else Path(args.out)
+    require(args.guess or out.suffix == ".mcap", out, "--out", "a name that ends in .mcap")
+    require_new(require_writable(out, "--out", source=source), is_forced=args.force)
     if args.guess:
-        return write_guess(args, source, require_new(out, is_forced=args.force))
-    require(out.suffix == ".mcap", out, "--out", "a name that ends in .mcap")
-    require_writable(out, "--out", source=source)
+        return write_guess(args, source, out)
     return import_by_map(args, source, out) if args.map else import_own(args, source, out)
 
 

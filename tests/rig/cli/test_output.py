@@ -98,8 +98,8 @@ def test_a_full_disk_leaves_what_was_there_and_no_part(tmp_path: Path, name: str
     out = tmp_path / "out"
     out.mkdir()
     words = ["import", f"{tmp_path}/in.csv"] if name == "run.mcap" else [
-        "recover" if name == "saved.mcap" else "export", f"{tmp_path}/trace.mcap", "--force"]
-    words += ["--out", str(out / name)]
+        "recover" if name == "saved.mcap" else "export", f"{tmp_path}/trace.mcap"]
+    words += ["--force", "--out", str(out / name)]
     for before in ({}, {name: b"before"}):
         for file, content in before.items():
             (out / file).write_bytes(content)
@@ -109,7 +109,7 @@ def test_a_full_disk_leaves_what_was_there_and_no_part(tmp_path: Path, name: str
         assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_simulate_export_and_recover_do_not_replace_a_file_unasked(sources: dict[str, Path], tmp_path: Path) -> None:
+def test_commands_do_not_replace_a_file_unasked(sources: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "s.csv"
     simulate = ["simulate", "--command", sources["command"], "--steps", "10", "--out", out, "--quiet"]
     assert rig(*simulate).status == 0
@@ -117,8 +117,9 @@ def test_simulate_export_and_recover_do_not_replace_a_file_unasked(sources: dict
     assert "--force" in refuse(*simulate, "--seed", "1") and out.read_bytes() == first
     assert rig(*simulate, "--seed", "1", "--force").status == 0 and out.read_bytes() != first
     assert [rig(command, source, "--out", tmp_path / name, *force).status
-            for command, source, name in (("export", out, "e.csv"), ("recover", sources["log"], "r.mcap"))
-            for force in ((), (), ("--force",))] == [0, 2, 0] * 2
+            for command, source, name in (("export", out, "e.csv"), ("recover", sources["log"], "r.mcap"),
+                                          ("import", out, "i.mcap"))
+            for force in ((), (), ("--force",))] == [0, 2, 0] * 3
 
 
 def test_a_failure_in_the_middle_leaves_the_file_before(tmp_path: Path) -> None:
