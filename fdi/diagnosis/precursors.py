@@ -13,7 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi.thresholds import BAND_EVENT_SAMPLES, POSITION_MISSING_SHARE
-from fdi.trace import Flags, Floats, Section, Trace, compute_speed, fill_gaps, filter_median, find_sections, hold_last
+from fdi.trace import (
+    Flags,
+    Floats,
+    Section,
+    Trace,
+    compute_speed,
+    fill_gaps,
+    filter_median,
+    find_sections,
+    find_stretches,
+    hold_last,
+)
 
 STEP_JUDGED_FROM = 0.004  # s; the command has to come through a cycle of the bus and the pilot stage
 STEP_JUDGED_UNTIL = 0.1  # s after a step at least; later the EHA only sticks and slips, which ramps show better
@@ -24,9 +35,8 @@ def find_stays(beyond: Flags, lasting: int = BAND_EVENT_SAMPLES) -> list[tuple[i
 
     One or two samples are no event; a single sample back inside does not end one.
     """
-    edges = np.flatnonzero(np.diff(beyond.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
     stays: list[tuple[int, int]] = []
-    for first, stop in edges.tolist():
+    for first, stop in find_stretches(beyond).tolist():
         if stays and first - stays[-1][1] <= lasting:
             stays[-1] = (stays[-1][0], stop - 1)
         elif stop - first >= lasting:

@@ -46,6 +46,7 @@ from fdi.report.numbers import (
 )
 from fdi.report.report import Cell, Column, Figure, Line, Medium, Mood, Report, Section, Table, tabulate
 from fdi.thresholds import BLOCK_ERROR_RATIO, CONTROLLER_ERROR_RATIO, DEPENDENCE_SHARE, FLOW_GAIN_FAR, NOISE_BAND_RATIO
+from fdi.trace import find_stretches
 from plant import Signal, count_nouns
 
 MOODS: dict[str, Mood] = {"WITHIN_FLOOR": "good", "MODEL_INCOMPLETE": "bad", "CANNOT_TELL": "doubtful"}
@@ -368,8 +369,8 @@ def find_quantity_axis(c: Comparison, kind: str) -> tuple[str, float]:
 def draw_overview(c: Comparison) -> str:
     """Command and position, then each signal measured and replayed, and its residual beside the noise floor."""
     t = c.trace.t
-    ends = np.flatnonzero(np.diff((c.replay.undecided | ~c.trace.usable).astype(int), prepend=0, append=0))
-    shades = [shade(float(t[a]), float(t[b - 1]), RED, 0.12) for a, b in ends.reshape(-1, 2)]
+    shades = [shade(float(t[a]), float(t[b - 1]), RED, 0.12)
+              for a, b in find_stretches(c.replay.undecided | ~c.trace.usable)]
     d = c.trace.declared
     command, controlled = d.command, d.controlled
     panels: list[Panel] = [[line(t, c.trace.command * command.shown_scale, COMMAND, f"{command.symbol}, command", 2.2),

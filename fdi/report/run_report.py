@@ -55,7 +55,16 @@ from fdi.report.report import (
     tabulate,
     write_html,
 )
-from fdi.trace import CheckResult, Event, Floats, Trace, bridge_gaps, compute_speed, fill_gaps, filter_median
+from fdi.trace import (
+    CheckResult,
+    Event,
+    Floats,
+    Trace,
+    compute_speed,
+    fill_gaps,
+    filter_median,
+    find_stretches,
+)
 from plant import EHA, UNITS, Signals, count_nouns
 
 MOODS: dict[str, Mood] = {"PASS": "good", "FAIL": "bad", "INVALID_TIMING": "doubtful", "ABORTED": "bad",
@@ -358,17 +367,19 @@ def draw_timing(trace: Trace) -> str:
 
 def _bridge_short_gaps(values: Floats) -> Floats:
     """Straight lines over up to BRIDGED missing samples: single samples between gaps would be invisible."""
-    if np.isnan(values).all():
-        return values
-    return np.where(bridge_gaps(values, BRIDGED)[1], np.nan, fill_gaps(values))
+    shown = fill_gaps(values)
+    for first, stop in find_stretches(np.isnan(values)):
+        if stop - first > BRIDGED or first == 0 or stop == len(values):
+            shown[first:stop] = np.nan
+    return shown
 
 
 def _mark_missing(trace: Trace, values: Floats, columns: int = 1400) -> Mark:
     """A red mark at the foot of the panel in each of so many columns in which samples are missing."""
     starts = np.linspace(0, len(values), min(columns, len(values)) + 1).astype(int)
     is_missing = np.logical_or.reduceat(np.isnan(values), starts[:-1])
-    edges = np.flatnonzero(np.diff(is_missing, prepend=False, append=False)).reshape(-1, 2)
-    ends = [(float(trace.t[starts[a]]), float(trace.t[starts[b] - 1]) + trace.period) for a, b in edges]
+    ends = [(float(trace.t[starts[a]]), float(trace.t[starts[b] - 1]) + trace.period)
+            for a, b in find_stretches(is_missing)]
     return spans(ends, RED, 0.04, lw=0.5, zorder=3)
 
 

@@ -51,6 +51,7 @@ from .trace import (
     Trace as Trace,
     bridge_gaps as bridge_gaps,
     fill_gaps as fill_gaps,
+    find_stretches as find_stretches,
     hold_last as hold_last,
     hold_next as hold_next,
     make_table_trace as make_table_trace,

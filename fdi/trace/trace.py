@@ -515,6 +515,15 @@ def shift_rows(x: Floats, rows: int) -> Floats:
     return x[np.clip(np.arange(len(x)) - rows, 0, len(x) - 1)]
 
 
+def find_stretches(flags: Flags) -> NDArray[np.int64]:
+    """First row and stop of each stretch of rows, (m, 2), in which `flags` (n,) are up.
+
+    >>> find_stretches(np.array([True, False, True, True])).tolist()
+    [[0, 1], [2, 4]]
+    """
+    return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
+
+
 def bridge_gaps(x: Floats, longest: int) -> tuple[Floats, Flags]:
     """Fill gaps of up to `longest` samples with cubics through the two samples on either side.
 
@@ -526,7 +535,7 @@ def bridge_gaps(x: Floats, longest: int) -> tuple[Floats, Flags]:
     sample_rows = rows[~is_missing]
     values = np.interp(rows, sample_rows, x[sample_rows])
     is_unknown = np.zeros(len(x), bool)
-    for first, stop in np.flatnonzero(np.diff(is_missing, prepend=False, append=False)).reshape(-1, 2):
+    for first, stop in find_stretches(is_missing):
         is_unknown[first:stop] = stop - first > longest or first == 0
     gaps = rows[is_missing & ~is_unknown]
     after = np.searchsorted(sample_rows, gaps)
