@@ -19,7 +19,7 @@ from fdi.estimation import (
     require_finite_replay,
     sensor_floors,
 )
-from fdi.trace import Trace
+from fdi.trace import Trace, locate_log
 from plant import InputError, Model, require
 
 
@@ -93,10 +93,8 @@ def _hash_columns(trace: Trace) -> str:
 
 def read_source(file: str) -> Source:
     """The file of a trace, or that of the run in a folder, with the hash of its bytes."""
-    path = Path(file)
-    data = path / "trace.mcap" if path.is_dir() else path
     try:
-        return Source(file, hashlib.sha256(data.read_bytes()).hexdigest())
+        return Source(file, hashlib.sha256(locate_log(Path(file)).read_bytes()).hexdigest())
     except OSError as error:
         raise InputError(file, "", f"a trace that can be read ({error.strerror})") from error
 

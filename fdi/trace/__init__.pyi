@@ -26,6 +26,7 @@ from .csv_table import (
 from .declaration import DECLARATION as DECLARATION, write_declaration as write_declaration
 from .mcap_log import (
     BoundedFile as BoundedFile,
+    locate_log as locate_log,
     open_log as open_log,
     read_declarations as read_declarations,
     scan_messages as scan_messages,

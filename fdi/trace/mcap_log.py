@@ -145,6 +145,11 @@ def _report_damage(path: Path, topic: str) -> Iterator[None]:
         raise InputError(path, topic, f"sound messages ({type(error).__name__}: {error})") from error
 
 
+def locate_log(path: Path) -> Path:
+    """The log in the folder of a run; another path as it is."""
+    return path / "trace.mcap" if path.is_dir() else path
+
+
 def open_log(path: Path) -> Log:
     """Read everything but the messages. Raises InputError for what is not a complete MCAP file."""
     try:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from fdi import foreign_code
-from fdi.trace import open_log
+from fdi.trace import locate_log, open_log
 from plant import InputError, Model, load_model, read_toml, require
 from plant.effects import load_effects
 from rig.run import find_visible_steps
@@ -83,7 +83,7 @@ def change_model(model: Model, args: argparse.Namespace) -> Model:
     log = find_log(args)
     if log is not None:
         with suppress(InputError, KeyError, ValueError):  # of an older log it is not known
-            step = float(open_log(log / "trace.mcap" if log.is_dir() else log).metadata["run"]["resolution"])
+            step = float(open_log(locate_log(log)).metadata["run"]["resolution"])
             args.set = [*(f"{name}={value:g}" for name, value in find_visible_steps(model, step).items()), *args.set]
     return model.replace(parse_changes(args.set))
 

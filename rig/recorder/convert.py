@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdi.output import require_writable, write_whole
-from fdi.trace import Trace, combine_columns, find_own_table, make_table_trace, open_log, write_sensors
+from fdi.trace import Trace, combine_columns, find_own_table, locate_log, make_table_trace, open_log, write_sensors
 from fdi.trace.importing.conversion import ImportMap
 from fdi.trace.importing.formats import Channel, Measurement, open_measurement
 from plant import InputError, count_nouns, read_file, report_system_error, require, signals as plant_signals
@@ -56,7 +56,7 @@ def export_trace(source: Path, out: Path, everything: bool = False) -> int:
     require(out.suffix in RAW_SUFFIXES, out, "--out", f"a name that ends in .csv, .csv.gz, {', '.join(RAW_SUFFIXES)}")
     import can
 
-    path = source / "trace.mcap" if source.is_dir() else source
+    path = locate_log(source)
     require(path.suffix == ".mcap", path, "", "a log with raw frames (.mcap)")
     raw = list(read_raw_frames(path))
     require(raw, path, "/can", "at least one raw frame")

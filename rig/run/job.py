@@ -18,7 +18,7 @@ from fdi.foreign_code import (
     require_trust,
 )
 from fdi.output import write_whole
-from fdi.trace import Trace, open_log
+from fdi.trace import Trace, locate_log, open_log
 from plant import (
     EHA,
     Choice,
@@ -210,7 +210,7 @@ def load_plant_of_log(path: Path, *, is_trusted: bool = False, announce: Announc
         InputError: it is not trusted, or cannot be used.
     """
     try:
-        log = open_log(path / "trace.mcap" if path.is_dir() else path)
+        log = open_log(locate_log(path))
         tables = parse_toml(log.attachments.get("model.toml", b"").decode(), f"{path}: model.toml")
     except (InputError, UnicodeDecodeError):  # whoever reads it as a trace says what is wrong
         return ""

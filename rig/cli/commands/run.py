@@ -11,7 +11,7 @@ from pathlib import Path
 
 from fdi.progress import Progress
 from fdi.report import Line, Medium, Report, Section, build_run_report, write_html
-from fdi.trace import Trace
+from fdi.trace import Trace, locate_log
 from plant import count_nouns, report_system_error, require
 from rig.cli import (
     LIVE_ON_TERMINAL,
@@ -197,7 +197,7 @@ def repeat_job(source: Path, args: argparse.Namespace) -> Job:
     """
     require(not (args.sequence or args.set or args.model or args.effects or args.bench or args.seed is not None),
             "--from", str(source), "no SEQUENCE, --model, --set, --seed, --effects or --bench: the log has them")
-    log = source / "trace.mcap" if source.is_dir() else source
+    log = locate_log(source)
     require(not (args.out and (Path(args.out) / "trace.mcap").resolve() == log.resolve()), "--out", args.out,
             "another folder than that of the log to repeat, which would be overwritten")
     job = read_job(source, is_trusted=args.trust)
