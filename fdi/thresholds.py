@@ -198,6 +198,10 @@ SUSPICIOUS_TOLERANCES = 3.0
 # Rounding of what the bus and the file hold gives 1; columns that are rounded twice, 1.9.
 FIRMWARE_DIFFERS = 3.0
 
+# Share of the controller's difference that an effect of the firmware may leave and still be named. A command that is
+# not what the controller received leaves half with the best of them.
+FIRMWARE_EXPLAINED = 0.2
+
 # Least noise, over that of the sensor, that a recording is taken to have: a simulated one may have none, and then the
 # error of the solver would be the only thing left to explain.
 #
@@ -431,6 +435,10 @@ SECTION_ERROR_SD = 5.0
 #
 # An error of the model is in both: they differ by less than that even where noise is coloured.
 RUN_IS_OFF, RUN_FITS = 4.0, 2.0
+
+# Share of rows in which a run is off and its repeat is not, from which on that is no stop of a hair more or less: the
+# two runs differ. In signals as a whole: RMS of one run, over the floor and that of each repeat.
+OFF_ALONE_SHARE, OFF_ALONE_RATIO = 0.1, 2.0
 
 # RMS residual over floor up to which a block of the actuator agrees: the floor of a balance is known less well than a
 # signal's.

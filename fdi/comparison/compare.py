@@ -53,6 +53,7 @@ from fdi.thresholds import (
     FINEST_COMB,
     LAG_MISFIT_RATIO,
     LOWER_BOUND_ERROR_RATIO,
+    OFF_ALONE_SHARE,
     REPEAT_DIFFERENCE_RATIO,
     REPEAT_FLOOR_RATIO,
     RUN_FITS,
@@ -296,6 +297,9 @@ def compare(trace: Trace, model: Model, repeats: Sequence[Trace] = (), signals: 
     table = {name: _measure_signal(trace.declared.find(name), r, floor[name], noise[name], loop_residual[name], replay)
              for name, r in residual.items()}
     doubtful = describe_doubtful_repeats(floor, widened, trace.declared)
+    if not doubtful and off_alone[trace.usable].mean() > OFF_ALONE_SHARE:
+        doubtful = (f"this run is off for {off_alone.sum() * trace.period:.1f} s in which a repeat is at the noise "
+                    "floor: the two differ, and no model explains both")
     progress("blocks", 4 / STAGES)
     ratios, parts = _judge_blocks(trace, model, replay.model, runs, table, answer, noise)
     progress("where", 5 / STAGES)

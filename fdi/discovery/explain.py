@@ -65,6 +65,7 @@ from fdi.thresholds import (
     ERROR_PARTLY_EXPLAINED,
     FINEST_COMB,
     FIRMWARE_DIFFERS,
+    FIRMWARE_EXPLAINED,
     FURTHER_EFFECT_SHARE,
     GAIN_CONVINCES,
     GAIN_DETECTED,
@@ -73,6 +74,7 @@ from fdi.thresholds import (
     GAIN_TIE,
     HELD_OUT_UNDECIDED_SHARE,
     INTERVAL_95_SD,
+    OFF_ALONE_RATIO,
     RESIDUAL_HELD_OUT,
     SIGNAL_SPOILED,
     SOLVER_ERROR_SHARE,
@@ -277,7 +279,8 @@ def _conclude(search: Search, levels: list[list[Hypothesis]], marks: Marks, prog
     part = bool(close) and _improves(search, base, close[0])
     costs = search.measure_unseen_costs([base, *close])
     verdict, effects = decide_verdict(base, close, holding, part, marks, floor, costs)
-    if verdict == "PARTLY" and close and is_periodic_in_position(search, base, close[0]):
+    if ((verdict in NOISE_LEFT and is_off_alone((close or [base])[0], floor))
+            or (verdict == "PARTLY" and close and is_periodic_in_position(search, base, close[0]))):
         effects = tuple(f.effect for f in marks.prints)
         verdict = "PARTLY" if effects else "UNEXPLAINED"
     best = close[0] if close and verdict == "EXPLAINED" else base
@@ -453,12 +456,11 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
     """
     costs = dict(zip([h.effects for h in (base, *close)], unseen or [0.0] * (1 + len(close)), strict=True))
     prints = tuple(f.effect for f in marks.prints)
-    firmware_left = marks.is_firmware_different and not any(p.is_firmware for p in marks.prints)
+    firmware_left = marks.is_firmware_different and not any(p.after <= FIRMWARE_DIFFERS for p in marks.prints
+                                                            if p.is_firmware)
     if not close:
-        if not base.is_at_floor or base.is_far:
+        if not base.is_at_floor or base.is_far or firmware_left:
             return ("PARTLY" if prints else "UNEXPLAINED"), prints
-        if firmware_left:
-            return "UNEXPLAINED", prints
         return ("EXPLAINED" if prints else "NOTHING_MISSING"), prints
     best = close[0]
     explanations = [h for h in holding if h.is_at_floor]
@@ -470,6 +472,8 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
             and (measure_gain(base, best) < GAIN_CONVINCES or (explanations and not sure))):
         alike = [h for h in close if not h.is_far and measure_gain(base, h) > GAIN_SEEN
                  and not _is_better(best, h, costs)]
+        if firmware_left:
+            return ("PARTLY" if prints else "UNEXPLAINED"), prints
         return ("NOT_RESOLVABLE", _list_effects([best, *alike])) if not prints else ("EXPLAINED", prints)
     explanations = sure
     if explanations and all(h.is_far for h in explanations):
@@ -497,6 +501,13 @@ def _is_better(h: Hypothesis, other: Hypothesis, unseen: Mapping[tuple[str, ...]
     """Whether one hypothesis explains more than another: its own runs, and these and the held-out run together."""
     gain = measure_gain(other, h)
     return gain >= GAIN_TIE and gain + unseen[other.effects] - unseen[h.effects] >= GAIN_CONVINCES
+
+
+def is_off_alone(h: Hypothesis, floor: Mapping[str, float]) -> bool:
+    """Whether a run is off where none of its repeats is: what happened once is no effect, and no noise either."""
+    return bool(h.others) and any(
+        error > OFF_ALONE_RATIO * max(floor[name], *(rms(other[i]) for other in h.others))
+        for i, (name, error) in enumerate(h.errors.items()))
 
 
 def explains_part(base: Hypothesis, h: Hypothesis, floor: Mapping[str, float]) -> bool:
@@ -616,7 +627,7 @@ def find_marks(model: Model, traces: Sequence[Trace]) -> Marks:
                  if e.firmware and e.name not in model.effects and len(e.fitted) == 1
                  and any(s[e.fitted[0]] != 0.0 for s in e.starts)]
         fingerprints = [_fit_size(model, traces, e, error, resolution) for e in names if error > FIRMWARE_DIFFERS]
-        firmware = sorted((f for f in fingerprints if f.after < 0.7 * error), key=lambda f: f.after)
+        firmware = sorted((f for f in fingerprints if f.after < FIRMWARE_EXPLAINED * error), key=lambda f: f.after)
         unseen = tuple(names) if np.isnan(rms) else ()
     return Marks(error, resolution, (*prints, *firmware[:1]), step, is_recorder, tuple(firmware[1:]), unseen)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fdi.comparison.compare import compare_controller
+from fdi.discovery.explain import is_off_alone
 from fdi.discovery.explain_runs import Answer, Candidate, Suspicious, list_own_candidates, list_shared_effects
 from fdi.discovery.laws.find_law import Law, LawCurve, LawSearch, Missing
 from fdi.discovery.laws.terms import describe_formula
@@ -183,7 +184,16 @@ def describe_verdict(a: Answer) -> str:
 
 
 def _describe_unexplained(a: Answer) -> str:
-    base = a.explanation.base
+    base, floor, signals = a.explanation.base, a.baseline["floor"], find_signals(a)
+    worst, best = _find_worst_signal(a.baseline["error"], floor), min(a.candidates, key=lambda c: c.ratio, default=None)
+
+    def describe_error(error: BySignal, s: str) -> str:
+        return f"{signals.find(s).symbol} error {_format(error, s, signals)}"
+
+    if base.is_at_floor and is_off_alone(base, floor):
+        return (f"The run differs from its repeat by more than noise ({describe_error(a.baseline['error'], worst)}, "
+                f"noise floor {_format(floor, worst, signals)}): what happened once is no effect. Compare runs under "
+                "the same loads.")
     if base.is_at_floor and base.is_far:
         return (f"The model explains the run {FAR_OFF} ({_describe_furthest(base)}), and no effect of the catalogue "
                 "does it with usual ones.")
@@ -193,12 +203,6 @@ def _describe_unexplained(a: Answer) -> str:
                 f"difference{describe_gains(compare_controller(e.search.problem.trace, e.search.problem.model))}."
                 if e.marks.is_firmware_different else
                 "The model fits this run, but not the held-out run; this run does not show what is missing.")
-    floor, signals = a.baseline["floor"], find_signals(a)
-    worst, best = _find_worst_signal(a.baseline["error"], floor), min(a.candidates, key=lambda c: c.ratio, default=None)
-
-    def describe_error(error: BySignal, s: str) -> str:
-        return f"{signals.find(s).symbol} error {_format(error, s, signals)}"
-
     return (f"No effect of the catalogue explains the residual: {describe_error(a.baseline['error'], worst)}, "
             f"noise floor {_format(floor, worst, signals)}"
             + (f"; the best, {join_words([*best.beside, best.effect])}, leaves "

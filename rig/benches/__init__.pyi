@@ -65,6 +65,7 @@ from .packing import (
     LAST_CYCLE as LAST_CYCLE,
     LENGTH as LENGTH,
     OTHER_CYCLE as OTHER_CYCLE,
+    OWED as OWED,
     PAYLOAD as PAYLOAD,
     ROLES as ROLES,
     SENT_AS as SENT_AS,

@@ -21,10 +21,11 @@ FRAMES, VALUES_AT = 16, 17  # how many frames, and where the values begin
 FRAMES_AT = 24
 # Columns of a frame. Of the loop: how many were sent, or the last alive counter; the last cycle in which one was taken,
 # -1 before. The first frame with an identifier counts for all of them: it is their _COUNT_OF. UNSOUND: frames with a
-# wrong checksum or alive counter. STATUS and CAME_WITH: of the last one that came, why it was not taken, and its bytes
+# wrong checksum or alive counter. STATUS and CAME_WITH: of the last one that came, why it was not taken, and its bytes.
+# OWED: cycles for which an earlier frame stood in, less the frames that came beyond one a cycle
 (IDENTIFIER, LENGTH, EVERY, IS_MINE, IS_BEFORE_SYNC, IS_ANSWER, IS_NUMBERED, ROLES, _FIRST, _END, _SELECTOR, COUNT,
- _COUNT_OF, UNSOUND, LAST_CYCLE, SENT_AS, STATUS, CAME_WITH) = range(18)
-FRAME_WORDS = 18
+ _COUNT_OF, UNSOUND, LAST_CYCLE, SENT_AS, STATUS, CAME_WITH, OWED) = range(19)
+FRAME_WORDS = 19
 # Roles of a frame, bits of ROLES; above them each frame has a bit of its own
 COMMAND, FEEDBACK, VALVE, DRIVE = 1, 2, 4, 8
 BITS = {"command": COMMAND, "feedback": FEEDBACK, "valve_state": VALVE, "drive": DRIVE}
@@ -275,7 +276,7 @@ def make_layout(frames: Sequence[FrameSpec], channels: Sequence[str], sender: Ro
             each.identifier, each.length, each.every, is_mine, each.is_before_sync, each.is_answer, _CYCLE in rules,
             sum(BITS[role] for role in each.roles) | 1 << _FIRST_OWN_BIT + number, field,
             field + _FIELD_WORDS * len(each.fields), -1, 0 if is_mine else -1, firsts.setdefault(each.identifier, at),
-            0, -1, each.sent_as, ACCEPTED, 0)
+            0, -1, each.sent_as, ACCEPTED, 0, 0)
         for one, rule in zip(each.fields, rules, strict=True):
             _fill_field(m, field, one, rule, places.get(one.name, -1))
             if one is each.selector:

@@ -35,6 +35,7 @@ from rig.benches import (
     LAST_CYCLE,
     LENGTH,
     OTHER_CYCLE,
+    OWED,
     PAYLOAD,
     ROLES,
     SENT_AS,
@@ -102,6 +103,7 @@ TIME, FRAME_HEAD, DATA = range(3)
 # Columns of a frame that waits: when it is due, its place in the layout, its length and 8 words of payload
 HELD_DUE, _HELD_PLACE, _HELD_LENGTH, _HELD_DATA = range(4)
 HELD_COLUMNS = _HELD_DATA + 8
+_MOST_OWED = 2  # frames of an answer: jitter owes one, a clock that drifts another
 
 
 class Buffers(NamedTuple):
@@ -383,7 +385,10 @@ def _copy_values(buffers: Buffers, m: Layout, first: int, last: int) -> None:
 
 
 def _expect_answers(buffers: Buffers, m: Layout) -> None:
-    """Which answers are sure to come in this cycle, and which values of earlier frames still count."""
+    """Which answers are sure to come in this cycle, and which values of earlier frames still count.
+
+    An answer may slip into the next cycle only as long as it does: frames that never come are owed.
+    """
     words = buffers.words
     words[CAME], words[AWAITED], words[IS_LATE] = 0, 0, 0
     if words[MOVES_PLANT]:
@@ -395,7 +400,11 @@ def _expect_answers(buffers: Buffers, m: Layout) -> None:
         if m.words[at + IS_MINE]:
             continue
         age = words[HAS_BEGUN] - m.words[at + LAST_CYCLE]
-        slack = words[SLACK] if m.words[at + IS_ANSWER] else words[MISSED_LIMIT]
+        slack = words[MISSED_LIMIT]
+        if m.words[at + IS_ANSWER]:
+            slack = words[SLACK] if m.words[at + OWED] < _MOST_OWED else 0
+            if m.words[at + LAST_CYCLE] >= 0 and age == m.words[at + EVERY] + 1:
+                m.words[at + OWED] += slack
         if m.words[at + LAST_CYCLE] >= 0 and age < m.words[at + EVERY] + slack:
             words[CAME] |= m.words[at + ROLES]
         elif m.words[at + IS_ANSWER] and age >= m.words[at + EVERY]:
@@ -479,6 +488,8 @@ def _keep_answer(buffers: Buffers, m: Layout, at: int, length: int, since_sync: 
     words = buffers.words
     roles = m.words[at + ROLES]
     is_first = m.words[at + LAST_CYCLE] != words[HAS_BEGUN] - 1
+    if words[HAS_BEGUN] - 1 - m.words[at + LAST_CYCLE] < m.words[at + EVERY] and m.words[at + OWED] >= 0:
+        m.words[at + OWED] -= 1
     if not (m.words[at + IS_NUMBERED] or is_first or roles & DRIVE):
         return
     status = unpack_frame(m, at, length, words[ROW_CYCLE])

@@ -282,8 +282,7 @@ def squares(seed: int, rows: int, extra: np.ndarray) -> np.ndarray:
     (lambda c, m: m.v > 5e-4, "ram extends"),
 ])
 def test_the_condition_is_named(c: Trace, m: Motion, find_rows: object, words: str) -> None:
-    rows = find_rows(c, m)  # type: ignore[operator]
-    z2 = squares(1, len(c), np.where(rows, 30.0, 0.0))
+    z2 = squares(1, len(c), np.where(find_rows(c, m), 30.0, 0.0))  # type: ignore[operator]
     message = find_condition(z2, m, LIMIT)
     assert message.startswith(("100 %", "99 %")) and re.search(words, message), message
 

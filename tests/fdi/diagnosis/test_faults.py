@@ -160,8 +160,7 @@ def pair(x: float, total: float, each: float) -> Any:
 def test_faults_that_only_show_as_a_sum_are_a_group(x: float, total: float, is_group: bool) -> None:
     """Each may be absent, but not both: then the sum would be 0."""
     refinement = pair(x, total, 5.0)
-    wide = {name: Estimate(x, 0.0, 1.0) for name in "ab"}
-    cut = cut_intervals(refinement, ["a", "b"], wide)
+    cut = cut_intervals(refinement, ["a", "b"], {name: Estimate(x, 0.0, 1.0) for name in "ab"})
     assert find_groups(refinement, dict.fromkeys("ab")) == (("a", "b"),) * is_group
     if x == 0.0:  # neither can be less than nothing, so neither can be much
         assert all(size.high < 0.08 for size in cut.values())

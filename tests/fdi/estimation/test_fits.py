@@ -242,8 +242,7 @@ def test_the_part_that_moves_is_chosen() -> None:
 def test_a_piece_is_what_the_whole_replay_has_there() -> None:
     """The lead-in makes a replay forget that it began in the middle; its rows are not compared."""
     trace = prepare_long()
-    excerpt = make_excerpt([(24_000, 26_000), (22_000, 23_000)])
-    part = cut_excerpt(trace, excerpt)
+    part = cut_excerpt(trace, make_excerpt([(24_000, 26_000), (22_000, 23_000)]))
     whole = make_problem(trace).predict_outputs((), np.empty((1, 0)))[0]
     cut = make_problem(part).predict_outputs((), np.empty((1, 0)))[0]
     rows = np.flatnonzero(part.usable)
@@ -452,8 +451,7 @@ def test_error_that_is_watched_while_a_backlash_is_added_falls_to_the_noise() ->
 def test_a_rest_hangs_on_stops_and_a_reversal_does_not() -> None:
     t = np.arange(0.0, 3.0, 1e-3)
     x = np.where(t < 1.0, 0.0, 3e-3 * np.sin(2.0 * np.pi * np.clip(t - 1.0, 0.0, 1.5)))  # rests, two reversals, rests
-    noise = 1e-6 * np.random.default_rng(0).standard_normal(len(t))
-    x = x + noise
+    x = x + 1e-6 * np.random.default_rng(0).standard_normal(len(t))
     x[[*range(500, 520), *range(1500, 2100)]] = np.nan  # of the longer gap nothing is known
     rest = find_rest_rows(x, 1e-3, 1e-6)
     assert rest[:1150].all() and not rest[1300:2490].any() and rest[2550:].all()  # and until a replay has forgotten it

@@ -206,8 +206,7 @@ def test_what_no_known_force_shows_has_a_wide_interval() -> None:
 
 
 def test_run_at_rest_identifies_nothing() -> None:
-    still = measure(np.zeros(800), np.zeros(800), 4, "still")
-    identification = identify([still], [])
+    identification = identify([measure(np.zeros(800), np.zeros(800), 4, "still")], [])
     assert (identification.verdict, identification.model) == (
         "CANNOT_TELL", load_model()) and "at rest" in identification.reason
     assert not any(e.is_identifiable for e in identification.estimates)

@@ -1,6 +1,7 @@
 """The cycle against a clock and a bus that do as the script says: due times, overruns, lateness, late frames."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from math import isnan
 
 import codec
 import pytest
@@ -11,6 +12,7 @@ from rig.benches import load_bench
 from rig.network import Frame, Master, VirtualClock
 from rig.nodes import Scenario
 from rig.run import CycleInput
+from rig.run.cycle import SLACK
 from rig.run.loop import CycleLoop
 from rig.sequences import Plan, Schedule
 
@@ -20,13 +22,13 @@ MS = 1_000_000  # ns
 class Bench:
     """A wire that answers each SYNC as a bench does, after a delay; time is what the script makes of it."""
 
-    def __init__(self, answer_ns: int = 0) -> None:
+    def __init__(self, answer_ns: int = 0, silent: Collection[int] = ()) -> None:
         self.clock = VirtualClock()
         self.receive: Callable[[Frame], None] = lambda frame: None
         self.sent: list[tuple[float, int, bytes]] = []  # ms
         self.stalls: dict[int, int] = {}  # SYNC number: ns that the machine stands still after it
         self.answers: list[Frame] = []
-        self._syncs, self._cycle, self._answer_ns = 0, 0, answer_ns
+        self._syncs, self._cycle, self._answer_ns, self._silent = 0, 0, answer_ns, silent
 
     def send(self, cob_id: int, data: bytes) -> None:
         now = self.clock.now()
@@ -37,7 +39,8 @@ class Bench:
             due = now + self._answer_ns
             self.answers += [Frame(due, codec.FEEDBACK, codec.pack_feedback(1e-3, 1e5)),
                              Frame(due, codec.VALVE_STATE, codec.pack_valve_state(1e-6, 0, self._syncs)),
-                             Frame(due, codec.DRIVE, codec.pack_drive(2e-3, 15, self._syncs))]
+                             Frame(due, codec.DRIVE, codec.pack_drive(2e-3, 15, self._syncs))][
+                                 :2 if self._syncs in self._silent else 3]
             self.clock.sleep_until(now + self.stalls.get(self._syncs, 0))
             self._syncs += 1
 
@@ -106,10 +109,19 @@ def test_due_times_are_a_fixed_grid(stalls: dict[int, int], syncs: list[float], 
 
 
 def test_response_and_work_are_measured_from_sync_to_reception() -> None:
-    bench = Bench(answer_ns=300_000)
-    one, book = loop(bench)
+    one, book = loop(Bench(answer_ns=300_000))
     run(one, 4)
     assert [t.response for t in book.timings] == pytest.approx([0.3e-3] * 4, abs=1e-6)
     for column in ("work", "feedback_response", "valve_response"):
         assert [getattr(t, column) for t in book.timings] == pytest.approx([0.3e-3] * 4, abs=1e-6)
     assert all(t.execution > 0 for t in book.timings)
+
+
+@pytest.mark.parametrize(("silent", "missing"), [
+    ({3}, set()), ({3, 7}, set()), ({3, 7, 11}, {11}), ({3, 4}, {4}), (set(range(1, 20, 2)), set(range(5, 20, 2)))])
+def test_without_sync_a_frame_may_slip_but_not_stay_away(silent: set[int], missing: set[int]) -> None:
+    """The frame before stands in for one that slips into the next cycle; of those that never come only for two."""
+    one, book = loop(Bench(silent=silent))
+    one._words[SLACK] = True
+    run(one, 20)
+    assert {row.cycle for row in book.rows if isnan(row.cor)} == missing
