@@ -384,7 +384,7 @@ class Session:
             heartbeats={NAMES[node]: times for node, times in self.nodes.heartbeats.items()},
             heard=(self.stage.begun_ns * 1e-9, self.stage.clock.now() * 1e-9),
             deaf=(self._master.wire.stalled_ns - self._stalled_ns) * 1e-9,
-            unsound=self.stage.playing.unsound if not job.sequence.disturbs_bus else 0,
+            unsound=None if job.sequence.disturbs_bus else self.stage.playing.unsound,
             deaf_cycles=self.faults.list_frame_hits("rig")[:, 0].tolist(), heartbeat_periods={
                 NAMES[node]: self._master.find_heartbeat(node) * 1e-3 for node in self.nodes.heartbeats},
             bench=job.bench,

@@ -136,7 +136,7 @@ class ProtocolRecord:
     heard: tuple[float, float] = (0.0, 0.0)
     deaf: float = 0.0
     deaf_cycles: Sequence[int] = ()
-    unsound: int = 0
+    unsound: int | None = 0
     heartbeat_periods: Mapping[str, Second] = field(default_factory=dict)  # of the nodes; 0.1 s unless it says another
     bench: Bench = field(default_factory=load_bench)
     drive_limit: float = nan  # NaN: the plant declares none
@@ -359,8 +359,9 @@ def _judge_drive_frames(record: ProtocolRecord, limits: ProtocolLimits) -> Itera
         else:
             yield SkippedCheck(name, "the controller's frames do not carry the number of the cycle")
     if any(each.protection for spec in specs for each in spec.fields):
-        yield _make_result("wrong checksums and alive counters", "drive", record.unsound, "1",
-                           high=largest_share * cycles)
+        name = "wrong checksums and alive counters"
+        yield (SkippedCheck(name, "faults of the sequence disturb the frames") if record.unsound is None else
+               _make_result(name, "drive", record.unsound, "1", high=largest_share * cycles))
 
 
 def _find_flagged(rows: Rows, flags: Flags) -> Mask:
@@ -487,7 +488,7 @@ def _judge_response(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[
 
 
 def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterator[CheckResult | SkippedCheck]:
-    """Median heartbeat period of each node.
+    """Median heartbeat period of each node, or for how long it has been silent at the end.
 
     A run in which the rig could receive for less than three periods says nothing about it. Nor do heartbeats that may
     have waited for the rig longer than the tolerance.
@@ -507,6 +508,9 @@ def _judge_heartbeats(record: ProtocolRecord, limits: ProtocolLimits) -> Iterato
             continue
         value = 1e3 * float(np.median(gaps)) if len(gaps) else nan
         detail = "" if len(gaps) else f"heartbeats in {end - begin:.3g} s: {len(beats)}"
+        silence = end - (t[-1] if len(beats) else end) - record.deaf
+        if silence > max(10.0 * period, 1.0):  # s, longer than a busy machine stands still
+            value, detail = 1e3 * float(silence), f"the last {silence:.3g} s without one"
         low, high = (round(1e3 * (period + sign * tolerance), 6) for sign in (-1, 1))
         yield _make_result(f"heartbeat period, {node}", HEARTBEAT, round(value, 6), "ms", low, high, detail)
 
