@@ -453,6 +453,12 @@ def decide_verdict(base: Hypothesis, close: Sequence[Hypothesis], holding: Seque
         marks: what the controller's output and the position show exactly.
         floor: of each signal, SI.
         unseen: costs of the base and of the best ones on the held-out run, where there is one.
+
+    >>> from types import SimpleNamespace
+    >>> base = SimpleNamespace(effects=(), is_at_floor=True, is_far=False)
+    >>> marks = [Marks(9e3, 1e-7, (Fingerprint("asymmetric_gain", {}, 9e3, left, True),)) for left in (1.0, 900.0)]
+    >>> [decide_verdict(base, [], [], False, each, {})[0] for each in marks]
+    ['EXPLAINED', 'PARTLY']
     """
     costs = dict(zip([h.effects for h in (base, *close)], unseen or [0.0] * (1 + len(close)), strict=True))
     prints = tuple(f.effect for f in marks.prints)
@@ -504,7 +510,13 @@ def _is_better(h: Hypothesis, other: Hypothesis, unseen: Mapping[tuple[str, ...]
 
 
 def is_off_alone(h: Hypothesis, floor: Mapping[str, float]) -> bool:
-    """Whether a run is off where none of its repeats is: what happened once is no effect, and no noise either."""
+    """Whether a run is off where none of its repeats is: what happened once is no effect, and no noise either.
+
+    >>> from types import SimpleNamespace
+    >>> runs = [SimpleNamespace(errors={"xj": 9.0}, others=(np.full((1, 5), repeat),)) for repeat in (1.0, 6.0)]
+    >>> [is_off_alone(run, {"xj": 1.0}) for run in runs]
+    [True, False]
+    """
     return bool(h.others) and any(
         error > OFF_ALONE_RATIO * max(floor[name], *(rms(other[i]) for other in h.others))
         for i, (name, error) in enumerate(h.errors.items()))

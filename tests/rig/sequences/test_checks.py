@@ -242,6 +242,7 @@ LATE = [Heartbeat(0.15 * k, 0.06) for k in range(6)]  # the rig stood still befo
     (ON_TIME, 0.0, [True]), (SLOW, 0.0, [False]), ([], 0.0, [False]), (ON_TIME[:1], 0.0, [False]), (LATE, 0.0, []),
     ([*ON_TIME[:5], Heartbeat(0.62, 0.12), *ON_TIME[7:]], 0.0, [True]),  # one stall
     ([*SLOW, Heartbeat(0.95, 0.3)], 0.0, [False]),  # a stall is no excuse for the other heartbeats
+    ([Heartbeat(0.1 * k - 1.0) for k in range(10)], 0.0, [False]),  # silent for the last 1.1 s
     ([], 0.5, [False]), ([], 0.8, []),  # s in which the rig received nothing: most of the run
 ])
 def test_heartbeats_that_waited_for_the_rig_are_not_judged(beats: list[Heartbeat], deaf: float, passes: list[bool]
