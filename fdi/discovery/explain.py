@@ -513,13 +513,14 @@ def is_off_alone(h: Hypothesis, floor: Mapping[str, float]) -> bool:
     """Whether a run is off where none of its repeats is: what happened once is no effect, and no noise either.
 
     >>> from types import SimpleNamespace
-    >>> runs = [SimpleNamespace(errors={"xj": 9.0}, others=(np.full((1, 5), repeat),)) for repeat in (1.0, 6.0)]
+    >>> fit = SimpleNamespace(residuals=np.full((1, 5), 9.0))
+    >>> runs = [SimpleNamespace(fit=fit, errors={"xj": 9.0}, others=(np.full((1, 5), x),)) for x in (1.0, 6.0)]
     >>> [is_off_alone(run, {"xj": 1.0}) for run in runs]
     [True, False]
     """
-    return bool(h.others) and any(
-        error > OFF_ALONE_RATIO * max(floor[name], *(rms(other[i]) for other in h.others))
-        for i, (name, error) in enumerate(h.errors.items()))
+    # not the errors of a long recording: the repeats were cut as the run was
+    return any(rms(h.fit.residuals[i, :h.others[0].shape[1]]) > OFF_ALONE_RATIO * max(
+        floor[name], *(rms(other[i]) for other in h.others)) for i, name in enumerate(h.errors) if h.others)
 
 
 def explains_part(base: Hypothesis, h: Hypothesis, floor: Mapping[str, float]) -> bool:
